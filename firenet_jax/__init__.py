@@ -1,0 +1,53 @@
+"""firenet_jax: recordings of event cameras become video, by FireNet as pure JAX functions.
+
+    reconstruct   readers -> events -> windows -> tensors -> network (scan) -> pictures -> video
+
+    import firenet_jax as fj
+
+    recording = fj.open_recording("dynamic_6dof.zip")
+    weights = fj.load_weights("firenet.npz")
+    state = fj.initial_state(batch=1, height=recording.height, width=recording.width)
+    for tensors, times in fj.event_tensors(recording, events_per_pixel=0.35):
+        state, images = fj.reconstruct(weights, state, tensors)
+
+Names are loaded when they are first used (PEP 562), so importing this package loads no jax.
+No module has the name of a function here: importing the module would hide the function.
+"""
+
+import importlib
+
+_HOME = {
+    "Display": "pictures",
+    "DisplayState": "pictures",
+    "Events": "events",
+    "Recording": "events",
+    "RecordingError": "events",
+    "State": "network",
+    "Weights": "network",
+    "display": "pictures",
+    "event_tensors": "tensors",
+    "initial_display_state": "pictures",
+    "initial_state": "network",
+    "load_weights": "checkpoint",
+    "normalise": "tensors",
+    "open_recording": "readers",
+    "reconstruct": "reconstruction",
+    "save_weights": "checkpoint",
+    "step": "network",
+    "voxelise": "tensors",
+    "write_video": "video",
+}
+
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str):
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__():
+    return __all__

@@ -1,0 +1,310 @@
+"""Weights <-> disk: one small .npz; published PyTorch checkpoints -> weights.
+
+A .npz holds the parameters under flat names ("gru1/gates/kernel", float32, kernels
+(rows, columns, in, out)), `normalise` (bool: the network expects normalised tensors) and
+`format` (int). It is read without pickle, and every name, shape, dtype and value is checked, so
+that what loads also runs. Whatever cannot be loaded raises CheckpointError, one sentence naming
+the file.
+"""
+
+import contextlib
+import importlib.resources
+import os
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import tyro
+
+from firenet_jax.network import BINS, CHANNELS, Weights
+from firenet_jax.pytorch_file import CheckpointError, read_state_dict
+
+FORMAT = 1
+MAX_BYTES = 2**20  # six times a whole file: what claims more is no FireNet and is not read
+PYTORCH = (".pth", ".pt", ".tar", ".ckpt")
+TRY = "pass a .npz written by this program or a FireNet or FireNet+ checkpoint of PyTorch (.pth)"
+
+# layer -> (kernel size, inputs, outputs), in the order of the network
+LAYERS = {
+    "head": (3, BINS, CHANNELS),
+    "gru1/gates": (3, 2 * CHANNELS, 2 * CHANNELS),  # inputs [x, h], outputs [reset, update]
+    "gru1/candidate": (3, 2 * CHANNELS, CHANNELS),
+    "res1/conv1": (3, CHANNELS, CHANNELS),
+    "res1/conv2": (3, CHANNELS, CHANNELS),
+    "gru2/gates": (3, 2 * CHANNELS, 2 * CHANNELS),
+    "gru2/candidate": (3, 2 * CHANNELS, CHANNELS),
+    "res2/conv1": (3, CHANNELS, CHANNELS),
+    "res2/conv2": (3, CHANNELS, CHANNELS),
+    "prediction": (1, CHANNELS, 1),
+}
+SHAPES: dict[str, tuple[int, ...]] = {}
+for _layer, (_size, _inputs, _outputs) in LAYERS.items():
+    SHAPES[f"{_layer}/kernel"] = (_size, _size, _inputs, _outputs)
+    SHAPES[f"{_layer}/bias"] = (_outputs,)
+
+
+# ---- npz
+
+
+def save_weights(path: str | Path, weights: Weights) -> None:
+    """Writes beside the final name and renames: a file with that name is always whole."""
+    path = Path(path)
+    if path.suffix != ".npz":
+        raise CheckpointError(f"{path}: weights are written as .npz; give it that ending")
+    flat = _flatten(weights.params)
+    _check(path, flat, "cannot be written")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with open(part, "wb") as file:
+            np.savez(file, format=np.int64(FORMAT), normalise=np.bool_(weights.normalise), **flat)
+        part.replace(path)
+    except OSError as error:
+        raise CheckpointError(
+            f"{path} cannot be written ({error.strerror or error}); "
+            "check that its folder exists, is writable and has space"
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()  # still there only where writing failed
+
+
+def load_weights(path: str | Path | None = None) -> Weights:
+    """Weights from a .npz, a PyTorch checkpoint or the folder of a training run.
+
+    None: the weights that come with the package.
+    """
+    if path is None:
+        return _load_default()
+    path = Path(path)
+    if path.is_dir():
+        path = path / "weights.npz"  # a training run keeps its newest weights here
+    if not path.is_file():
+        raise CheckpointError(f"{path} does not exist or is not a file; {TRY}")
+    if path.suffix in PYTORCH:
+        return convert(path)
+    if path.suffix == ".npz":
+        return _load_npz(path)
+    raise CheckpointError(f"{path} has an unknown ending {path.suffix!r}; {TRY}")
+
+
+def _load_default() -> Weights:
+    file = importlib.resources.files("firenet_jax") / "weights" / "firenet.npz"
+    if not file.is_file():
+        raise CheckpointError(
+            "no weights come with this version; pass --weights FILE, a .npz written by this "
+            "program or a published FireNet checkpoint (.pth)"
+        )
+    with importlib.resources.as_file(file) as path:
+        return _load_npz(path)
+
+
+def _load_npz(path: Path) -> Weights:
+    try:
+        # Damaged and hostile files claim any size: look at the archive before reading it.
+        with zipfile.ZipFile(path) as archive:
+            size = sum(info.file_size for info in archive.infolist())
+        if size > MAX_BYTES:
+            raise CheckpointError(f"{path} holds {size} bytes and is not a FireNet (157 kB); {TRY}")
+        with np.load(path, allow_pickle=False) as file:
+            flat = {name: file[name] for name in file.files}
+        if not all(isinstance(value, np.ndarray) for value in flat.values()):
+            raise ValueError("a member is not an array")
+    except CheckpointError:
+        raise
+    except Exception as error:  # damaged bytes reach every kind: Value, Key, BadZip, zlib, Memory
+        reason = " ".join(str(error).split())[:100]  # numpy's span lines
+        raise CheckpointError(
+            f"{path} is not a whole .npz of weights ({type(error).__name__}: {reason}); {TRY}"
+        ) from error
+    version = flat.pop("format", None)
+    normalise = flat.pop("normalise", None)
+    if version is None or version.shape != () or version.dtype.kind != "i":
+        raise CheckpointError(f"{path} has no format number, so it holds no weights; {TRY}")
+    if version != FORMAT:
+        raise CheckpointError(
+            f"{path} is of format {version}, this program reads format {FORMAT}; "
+            "install the version that wrote it"
+        )
+    if normalise is None or normalise.shape != () or normalise.dtype != bool:
+        raise CheckpointError(f"{path} does not say whether tensors are normalised; {TRY}")
+    _check(path, flat, "holds no FireNet")
+    return Weights(params=_unflatten(flat), normalise=bool(normalise))
+
+
+def _check(path: Path, flat: dict[str, np.ndarray], problem: str) -> None:
+    """Every name, shape, dtype and value."""
+    for name, shape in SHAPES.items():
+        if name not in flat:
+            raise CheckpointError(f"{path} {problem}: {name} is missing; {TRY}")
+        found = flat[name]
+        if found.shape != shape or found.dtype != np.float32:
+            raise CheckpointError(
+                f"{path} {problem}: {name} should be float32 {shape} and is "
+                f"{found.dtype} {found.shape}; {TRY}"
+            )
+        if not np.isfinite(found).all():
+            raise CheckpointError(
+                f"{path} {problem}: {name} has values that are not finite; "
+                "go back to weights from before training diverged"
+            )
+    for name in flat:
+        if name not in SHAPES:
+            raise CheckpointError(f"{path} {problem}: it has no place for {name!a}; {TRY}")
+
+
+def _flatten(tree, prefix: str = "") -> dict[str, np.ndarray]:
+    """{"gru1": {"gates": {"bias": b}}} -> {"gru1/gates/bias": b}"""
+    flat = {}
+    for name, value in tree.items():
+        if hasattr(value, "items"):
+            flat |= _flatten(value, f"{prefix}{name}/")
+        else:
+            flat[prefix + name] = np.asarray(value)
+    return flat
+
+
+def _unflatten(flat: dict[str, np.ndarray]) -> dict:
+    tree: dict = {}
+    for name, value in flat.items():
+        *groups, leaf = name.split("/")
+        place = tree
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[leaf] = value
+    return tree
+
+
+# ---- PyTorch
+
+
+class _Names(NamedTuple):
+    """How one family of PyTorch checkpoints names the blocks of the network."""
+
+    normalise: bool
+    blocks: dict[str, str]
+
+
+FAMILIES = {
+    "FireNet": _Names(
+        True,
+        {
+            "head": "head.conv.conv2d",
+            "gru1": "head.recurrent_block",
+            "res1": "resblocks.0.conv",
+            "gru2": "resblocks.0.recurrent_block",  # the block convolves before its GRU
+            "res2": "resblocks.1",
+            "prediction": "pred.conv2d",
+        },
+    ),
+    "FireNet+": _Names(
+        False,
+        {
+            "head": "head.conv2d",
+            "gru1": "G1",
+            "res1": "R1",
+            "gru2": "G2",
+            "res2": "R2",
+            "prediction": "pred.conv2d",
+        },
+    ),
+}
+PARTS = {
+    "gates": [".reset_gate", ".update_gate"],
+    "candidate": [".out_gate"],
+    "conv1": [".conv1"],
+    "conv2": [".conv2"],
+    "": [""],
+}
+
+
+def convert(path: str | Path) -> Weights:
+    """PyTorch checkpoint of FireNet or FireNet+ -> Weights: OIHW -> HWIO, two gates -> one."""
+    path = Path(path)
+    tensors = read_state_dict(path)
+    prefix, names = _family(path, tensors)
+    used = set()
+
+    def take(name: str, shape: tuple[int, ...]) -> np.ndarray:
+        found = tensors.get(prefix + name)
+        if found is None:
+            raise CheckpointError(f"{path} holds no FireNet: {prefix + name!a} is missing; {TRY}")
+        if found.shape != shape or found.dtype.kind != "f":
+            raise CheckpointError(
+                f"{path} holds no FireNet: {prefix + name!a} should be floats {shape} and is "
+                f"{found.dtype} {found.shape}; {TRY}"
+            )
+        used.add(prefix + name)
+        with np.errstate(over="ignore"):  # float64 beyond float32 becomes inf: refused below
+            return found.astype(np.float32)
+
+    flat = {}
+    for layer, (size, inputs, outputs) in LAYERS.items():
+        block, _, part = layer.partition("/")
+        sources = [names.blocks[block] + ending for ending in PARTS[part]]
+        each = outputs // len(sources)
+        kernels = [take(f"{source}.weight", (each, inputs, size, size)) for source in sources]
+        biases = [take(f"{source}.bias", (each,)) for source in sources]
+        flat[f"{layer}/kernel"] = np.concatenate(kernels).transpose(2, 3, 1, 0).copy()
+        flat[f"{layer}/bias"] = np.concatenate(biases)
+
+    for name in tensors:  # a layer that we would leave out: the images would be quietly wrong
+        if name.startswith(prefix) and name not in used:
+            raise CheckpointError(
+                f"{path} holds no FireNet: FireNet has no place for {name!a}; {TRY}"
+            )
+    _check(path, flat, "holds no FireNet")
+    return Weights(params=_unflatten(flat), normalise=names.normalise)
+
+
+def _family(path: Path, tensors: dict[str, np.ndarray]) -> tuple[str, _Names]:
+    """The family by the name of its first layer, and what stands before it (net., module.)."""
+    found = []
+    for names in FAMILIES.values():
+        first = f"{names.blocks['head']}.weight"
+        found += [
+            (name.removesuffix(first), names)
+            for name in tensors
+            if name == first or name.endswith("." + first)
+        ]
+    if not found:
+        anchors = " or ".join(f"{n.blocks['head']}.weight ({f})" for f, n in FAMILIES.items())
+        raise CheckpointError(
+            f"{path} holds no FireNet: expected {anchors}, found {len(tensors)} other names, "
+            f"the first {next(iter(tensors))!a}; {TRY}"
+        )
+    if len(found) > 1:
+        raise CheckpointError(
+            f"{path} holds several networks ({', '.join(repr(prefix) for prefix, _ in found)}); "
+            "save one of them alone"
+        )
+    return found[0]
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Turn a published PyTorch checkpoint of FireNet or FireNet+ into a small .npz of weights.
+
+    PyTorch is not needed, and nothing that the checkpoint holds is executed.
+
+    Examples:
+      firenet convert model.pth -o firenet.npz
+    """
+
+    checkpoint: tyro.conf.Positional[Path]
+    """The PyTorch file, as its authors publish it."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Where the weights go, a name that ends in .npz."""
+    overwrite: bool = False
+    """Replace an output that exists."""
+
+
+def run(settings: Convert) -> None:
+    if settings.output.exists() and not settings.overwrite:
+        raise CheckpointError(f"{settings.output} exists; choose another name or pass --overwrite")
+    weights = convert(settings.checkpoint)
+    save_weights(settings.output, weights)
+    count = sum(value.size for value in _flatten(weights.params).values())
+    tensors = "normalised" if weights.normalise else "raw"
+    print(f"{settings.output}: {count:,} parameters, for {tensors} event tensors")

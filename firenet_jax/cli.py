@@ -1,0 +1,76 @@
+"""Command line -> one command: firenet reconstruct | info | convert.
+
+A command is a frozen dataclass of settings and a `run(settings)` beside it, in a module that is
+imported only when the command is named: `firenet --help` loads no jax.
+"""
+
+import importlib
+import inspect
+import logging
+import os
+import sys
+
+# name: (module, settings, what it does)
+COMMANDS = {
+    "reconstruct": ("firenet_jax.pipeline", "Reconstruct", "recordings -> video or pictures"),
+    "info": ("firenet_jax.info", "Info", "what a recording holds"),
+    "convert": ("firenet_jax.checkpoint", "Convert", "PyTorch checkpoint -> weights.npz"),
+}
+
+
+def usage() -> str:
+    lines = [f"  firenet {name:13} {summary}" for name, (_, _, summary) in COMMANDS.items()]
+    return "\n".join(
+        [
+            "firenet_jax: recordings of event cameras become video (FireNet in JAX)",
+            "",
+            *lines,
+            "",
+            "firenet COMMAND --help explains a command, with examples.",
+        ]
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs one command; returns the exit code. Errors of a user's making are one sentence."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(usage())
+        return 0 if arguments else 2
+    if arguments[0] == "--version":
+        from importlib.metadata import version
+
+        print(version("firenet-jax"))
+        return 0
+    if arguments[0] not in COMMANDS:
+        print(f"firenet: no command {arguments[0]!r}\n\n{usage()}", file=sys.stderr)
+        return 2
+
+    import tyro
+
+    logging.basicConfig(format="firenet: %(message)s", level=logging.WARNING)
+    name, rest = arguments[0], arguments[1:]
+    module, settings, _ = COMMANDS[name]
+    try:
+        command = importlib.import_module(module)
+        parsed = tyro.cli(
+            getattr(command, settings),
+            prog=f"firenet {name}",
+            description=inspect.getdoc(getattr(command, settings)),
+            args=rest,
+            config=(tyro.conf.OmitArgPrefixes,),
+        )
+        command.run(parsed)
+    except KeyboardInterrupt:
+        print("firenet: interrupted; a folder of pictures goes on when run again", file=sys.stderr)
+        return 130
+    except (ValueError, OSError) as error:
+        if os.environ.get("FIRENET_DEBUG"):
+            raise
+        print(f"firenet: error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

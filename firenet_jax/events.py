@@ -1,0 +1,146 @@
+"""Columns -> Events: what an event is, and the checks that every recording passes at the door.
+
+An event (t, x, y, p) says that the pixel in column x and row y became brighter (p true, "ON") or
+darker (p false, "OFF") by one contrast threshold at time t. Times are int64 microseconds: float32
+seconds lose microseconds after 16 s. A recording is a stream of `Events` chunks in time order.
+"""
+
+import logging
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+logger = logging.getLogger("firenet_jax")
+
+
+class RecordingError(ValueError):
+    """A recording cannot be used; the message is one sentence: file, place, found, what to do."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Events:
+    """N events in time order, one array per column."""
+
+    t: np.ndarray  # (N,) int64, microseconds
+    x: np.ndarray  # (N,) int16, column, 0 at the left
+    y: np.ndarray  # (N,) int16, row, 0 at the top
+    p: np.ndarray  # (N,) bool, True: brighter
+
+    def __len__(self) -> int:
+        return self.t.shape[0]
+
+    def select(self, index) -> "Events":
+        """The events that a slice, a mask or an index array picks."""
+        return Events(self.t[index], self.x[index], self.y[index], self.p[index])
+
+    @classmethod
+    def of(cls, t, x, y, p) -> "Events":
+        """Columns of any integer dtype -> Events with the dtypes above."""
+        return cls(
+            np.asarray(t, np.int64),
+            np.asarray(x, np.int16),
+            np.asarray(y, np.int16),
+            np.asarray(p, bool),
+        )
+
+    @classmethod
+    def empty(cls) -> "Events":
+        return cls.of([], [], [], [])
+
+
+def concatenate(chunks: list[Events]) -> Events:
+    """Chunks -> one chunk; without copying when there is only one."""
+    if len(chunks) == 1:
+        return chunks[0]
+    columns = ([getattr(chunk, name) for chunk in chunks] for name in "txyp")
+    return Events(*map(np.concatenate, columns))
+
+
+class Frames(NamedTuple):
+    """The pictures that some cameras take beside the events."""
+
+    times: np.ndarray  # (F,) int64, microseconds, on the clock of the events
+    read: Callable[[int], np.ndarray]  # i -> (H, W) uint8
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A file or folder of events, opened but not read: memory does not grow with its length."""
+
+    path: Path
+    format: str  # in words, for people: "ECD folder"
+    height: int
+    width: int
+    events: Callable[[], Iterator[Events]]  # every call starts from the first event
+    count: int | None = None  # number of events, where the file says it
+    frames: Frames | None = None
+
+    @property
+    def pixels(self) -> int:
+        return self.height * self.width
+
+
+def event_number(row: int) -> str:
+    """The place of an event, counted from 1, in a file that has no lines."""
+    return f"event {row + 1}"
+
+
+def checked(
+    chunks: Iterable[Events],
+    path: Path,
+    height: int | None,
+    width: int | None,
+    place: Callable[[int], str] = event_number,
+) -> Iterator[Events]:
+    """Passes chunks on; raises RecordingError at the first event that cannot be.
+
+    Time must not run backwards, within a chunk or between two; x and y must not be negative, nor
+    reach the sensor's width and height where these are known. `place(row)` names the row (counted
+    from 0 over the whole recording) in the words of the file: "line 7".
+    """
+    rows, last = 0, None
+    for events in chunks:
+        if len(events) == 0:
+            continue
+        t = events.t
+        if last is not None and t[0] < last:
+            _refuse_time(path, place(rows), t[0], last)
+        steps = np.diff(t)
+        if steps.size and steps.min() < 0:
+            row = int(np.argmax(steps < 0)) + 1
+            _refuse_time(path, place(rows + row), t[row], t[row - 1])
+        for name, column, size in (("x", events.x, width), ("y", events.y, height)):
+            if column.min() < 0:
+                row = int(np.argmax(column < 0))
+                raise RecordingError(
+                    f"{path}, {place(rows + row)}: {name} is {column[row]}, but coordinates are "
+                    "0 or more: the file is damaged or of another format"
+                )
+            if size is not None and column.max() >= size:
+                row = int(np.argmax(column >= size))
+                raise RecordingError(
+                    f"{path}, {place(rows + row)}: {name} is {column[row]}, outside the sensor of "
+                    f"{width}x{height} pixels: pass the right --sensor-size WIDTHxHEIGHT"
+                )
+        rows, last = rows + len(events), t[-1]
+        yield events
+
+
+def _refuse_time(path: Path, where: str, time: int, previous: int):
+    raise RecordingError(
+        f"{path}, {where}: time runs backwards, from {previous} to {time} us: "
+        "sort the events by time, or cut the recording there"
+    )
+
+
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    """ "240x180" -> (height, width) = (180, 240)."""
+    if text is None:
+        return None
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise ValueError(f"sensor size {text!r}: expected WIDTHxHEIGHT, such as 240x180")
+    return int(height), int(width)

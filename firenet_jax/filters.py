@@ -1,0 +1,102 @@
+"""Event stream -> event stream: part of the time, without hot pixels, upside down.
+
+Each filter takes and gives an iterator of `Events` chunks and never holds more than one.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from firenet_jax.events import Events, Recording, RecordingError
+
+
+def between(chunks: Iterable[Events], start: float | None, stop: float | None) -> Iterator[Events]:
+    """Events with start <= t < stop, in seconds after the recording's first event."""
+    first = None
+    for events in chunks:
+        first = events.t[0] if first is None else first
+        bounds = [first + round((start or 0) * 1e6), np.iinfo(np.int64).max]
+        if stop is not None:
+            bounds[1] = first + round(stop * 1e6)
+        a, b = np.searchsorted(events.t, bounds)
+        if b > a:
+            yield events.select(slice(a, b))
+        if b < len(events):
+            return
+
+
+def without(chunks: Iterable[Events], hot: np.ndarray) -> Iterator[Events]:
+    """Drops the events of hot pixels; hot: (H, W) bool.
+
+    They are dropped before the cut, so that a window of N events holds N useful ones. (The
+    original program cuts first and blanks the pixels afterwards.)
+    """
+    for events in chunks:
+        kept = events.select(~hot[events.y, events.x])
+        if len(kept):
+            yield kept
+
+
+def turned(chunks: Iterable[Events], height: int, width: int) -> Iterator[Events]:
+    """Turns the picture by 180 degrees, for cameras that hang upside down."""
+    for events in chunks:
+        yield replace(events, x=width - 1 - events.x, y=height - 1 - events.y)
+
+
+def find_hot_pixels(recording: Recording, most: int = 5_000_000) -> np.ndarray:
+    """Recording -> (H, W) bool: pixels that fire without a reason, found in the first events.
+
+    A hot pixel fires alone: at least 10 times as often as the median of its 5x5 neighbourhood,
+    and more often than any pixel would by chance (6 standard deviations above the mean of the
+    pixels that fire; at least 10 events). A moving edge fires its neighbours too.
+    most: how many events to look at.
+    """
+    counts = np.zeros(recording.pixels, np.int64)
+    seen = 0
+    for events in recording.events():
+        pixels = events.y.astype(np.int64) * recording.width + events.x
+        counts += np.bincount(pixels, minlength=counts.size)
+        seen += len(events)
+        if seen >= most:
+            break
+    return hot_pixels_of(counts.reshape(recording.height, recording.width))
+
+
+def hot_pixels_of(counts: np.ndarray) -> np.ndarray:
+    """(H, W) event counts -> (H, W) bool, as `find_hot_pixels` says."""
+    active = counts[counts > 0]
+    if active.size == 0:
+        return np.zeros(counts.shape, bool)
+    alone = counts >= 10 * np.maximum(median_filter(counts, size=5, mode="reflect"), 1)
+    return alone & (counts > active.mean() + 6 * active.std())
+
+
+def read_hot_pixels(path: str | Path, height: int, width: int) -> np.ndarray:
+    """A text file with one `x,y` a line -> (H, W) bool, the format of rpg_e2vid.
+
+    Raises RecordingError naming the line that is not one.
+    """
+    path = Path(path)
+    hot = np.zeros((height, width), bool)
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path}: cannot read this list of hot pixels: {error}") from error
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        try:
+            x, y = (int(word) for word in line.split(","))
+        except ValueError:
+            raise RecordingError(
+                f"{path}, line {number}: expected `x,y`, found {line[:40]!r}"
+            ) from None
+        if not (0 <= x < width and 0 <= y < height):
+            raise RecordingError(
+                f"{path}, line {number}: pixel {x},{y} is outside the sensor of {width}x{height}"
+            )
+        hot[y, x] = True
+    return hot

@@ -1,0 +1,98 @@
+"""Recording -> facts about it: what a person wants to know before reconstructing.
+
+The events are read once.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from firenet_jax.events import RecordingError, parse_size
+from firenet_jax.filters import hot_pixels_of
+from firenet_jax.readers import open_recording
+from firenet_jax.windows import Windows
+
+
+@dataclass(frozen=True)
+class Info:
+    """Say what a recording holds: format, sensor, events, rate, frames, hot pixels, window size.
+
+    Examples:
+      firenet info recording.zip
+      firenet info recording.raw --json
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """Text, zip, HDF5, ECD or EVREAL folder, .bin, .dat, .raw, .aedat4, .es, ROS bag."""
+    sensor_size: str | None = None
+    """WIDTHxHEIGHT of the sensor, where the recording does not say it."""
+    json: bool = False
+    """Print JSON instead of lines."""
+
+
+def describe(path: Path, sensor_size: tuple[int, int] | None = None) -> dict:
+    """Facts of a recording, in the order in which a person wants them."""
+    recording = open_recording(path, sensor_size)
+    counts = np.zeros(recording.pixels, np.int64)
+    on = first = last = None
+    with tqdm(total=recording.count, unit="ev", unit_scale=True, disable=None) as progress:
+        for events in recording.events():
+            pixels = events.y.astype(np.int64) * recording.width + events.x
+            counts += np.bincount(pixels, minlength=counts.size)
+            on = (on or 0) + int(events.p.sum())
+            first = int(events.t[0]) if first is None else first
+            last = int(events.t[-1])
+            progress.update(len(events))
+    total = int(counts.sum())
+    if total == 0:
+        raise RecordingError(
+            f"{path}: holds no events: check that it was recorded and copied whole"
+        )
+    hot = np.argwhere(hot_pixels_of(counts.reshape(recording.height, recording.width)))
+    seconds = (last - first) / 1e6
+    window = Windows().count(recording.pixels)
+    return {
+        "recording": str(path),
+        "format": recording.format,
+        "width": recording.width,
+        "height": recording.height,
+        "events": total,
+        "first_event_us": first,
+        "last_event_us": last,
+        "duration_s": seconds,
+        "events_per_second": total / seconds if seconds else None,
+        "on_share": on / total,
+        "frames": 0 if recording.frames is None else len(recording.frames.times),
+        "hot_pixels": [[int(x), int(y)] for y, x in hot],
+        "events_per_window": window,
+        "windows": -(-total // window),
+    }
+
+
+def run(settings: Info) -> None:
+    facts = describe(settings.recording, parse_size(settings.sensor_size))
+    if settings.json:
+        print(json.dumps(facts, indent=2))
+        return
+    rate = facts["events_per_second"]
+    hot = facts["hot_pixels"]
+    shown = ", ".join(f"{x},{y}" for x, y in hot[:8]) + (", ..." if len(hot) > 8 else "")
+    lines = {
+        "format": facts["format"],
+        "sensor": f"{facts['width']}x{facts['height']} pixels",
+        "events": f"{facts['events']:,}",
+        "duration": f"{facts['duration_s']:.6f} s, from {facts['first_event_us']} us",
+        "rate": "all at one time" if rate is None else f"{rate / 1e6:.3f} million events/s",
+        "polarity": f"{facts['on_share']:.1%} ON",
+        "frames": f"{facts['frames']}" if facts["frames"] else "none",
+        "hot pixels": f"{len(hot)}" + (f" (x,y: {shown})" if hot else ""),
+        "window": f"{facts['events_per_window']:,} events (0.35 per pixel): "
+        f"{facts['windows']} images",
+    }
+    print(facts["recording"])
+    for name, value in lines.items():
+        print(f"  {name:10}  {value}")

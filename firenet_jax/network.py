@@ -1,0 +1,135 @@
+"""(State, event tensor) -> (State, image): FireNet as a pure function, the body of a scan.
+
+Scheerlinck et al., WACV 2020: H (3x3 convolution, ReLU), G1 (ConvGRU), R1 (residual block), G2,
+R2, P (1x1 convolution, no activation); 16 channels, zero padding, no striding, no normalisation;
+37,777 parameters. Event tensors are (B, H, W, 5) and images (B, H, W), float32, nominally 0 to 1
+and not clipped here. The receptive field of one step is 19x19 (through the reset gate).
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+CHANNELS = 16
+BINS = 5
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["params"], meta_fields=["normalise"])
+@dataclass(frozen=True)
+class Weights:
+    """What a trained network is: its parameters, and whether it expects normalised tensors."""
+
+    params: Any  # nested dict of float32 arrays, kernels (3, 3, in, out)
+    normalise: bool  # FireNet True, FireNet+ False
+
+
+class State(NamedTuple):
+    """What the network remembers between windows: the hidden maps of its two ConvGRUs."""
+
+    g1: jax.Array  # (B, H, W, 16) float32
+    g2: jax.Array  # (B, H, W, 16) float32
+
+
+def initial_state(batch: int, height: int, width: int) -> State:
+    """The state before the first window: zeros."""
+    zeros = jnp.zeros((batch, height, width, CHANNELS), jnp.float32)
+    return State(zeros, zeros)
+
+
+def _uniform(fan_in: int):
+    """PyTorch's default: uniform in +-1/sqrt(fan_in), for kernels and biases."""
+    bound = fan_in**-0.5
+
+    def init(key, shape, dtype=jnp.float32):
+        return jax.random.uniform(key, shape, dtype, -bound, bound)
+
+    return init
+
+
+def _conv(size: int, inputs: int, outputs: int, dtype) -> nn.Conv:
+    init = _uniform(size * size * inputs)
+    return nn.Conv(outputs, (size, size), dtype=dtype, kernel_init=init, bias_init=init)
+
+
+class ConvGRU(nn.Module):
+    """h' = (1 - z) h + z q, with z, r = sigmoid(conv([x, h])) and q = tanh(conv([x, r h])).
+
+    Input before state in the concatenation; the update gate z weighs the candidate q, the other
+    way round than in Flax's own cells. `gates` holds both gates, reset before update: one
+    convolution with 32 outputs is faster than two with 16.
+    """
+
+    features: int
+    dtype: Any = jnp.float32
+
+    def setup(self):
+        def conv(outputs):
+            init = nn.initializers.orthogonal()
+            return nn.Conv(outputs, (3, 3), dtype=self.dtype, kernel_init=init)
+
+        self.gates = conv(2 * self.features)
+        self.candidate = conv(self.features)
+
+    def __call__(self, h: jax.Array, x: jax.Array) -> jax.Array:
+        gates = nn.sigmoid(self.gates(jnp.concatenate([x, h], -1)))
+        r, z = jnp.split(gates, 2, -1)
+        q = nn.tanh(self.candidate(jnp.concatenate([x, r * h], -1)))
+        return (1 - z) * h + z * q
+
+
+class ResidualBlock(nn.Module):
+    """relu(x + conv2(relu(conv1(x))))"""
+
+    features: int
+    dtype: Any = jnp.float32
+
+    def setup(self):
+        self.conv1 = _conv(3, self.features, self.features, self.dtype)
+        self.conv2 = _conv(3, self.features, self.features, self.dtype)
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        return nn.relu(x + self.conv2(nn.relu(self.conv1(x))))
+
+
+class FireNet(nn.Module):
+    """The network; dtype is that of the convolutions, state and image stay float32."""
+
+    dtype: Any = jnp.float32
+
+    def setup(self):
+        self.head = _conv(3, BINS, CHANNELS, self.dtype)
+        self.gru1 = ConvGRU(CHANNELS, self.dtype)
+        self.res1 = ResidualBlock(CHANNELS, self.dtype)
+        self.gru2 = ConvGRU(CHANNELS, self.dtype)
+        self.res2 = ResidualBlock(CHANNELS, self.dtype)
+        self.prediction = _conv(1, CHANNELS, 1, self.dtype)
+
+    def __call__(self, state: State, event_tensor: jax.Array) -> tuple[State, jax.Array]:
+        x = nn.relu(self.head(event_tensor))
+        g1 = self.gru1(state.g1, x)
+        x = self.res1(g1)
+        g2 = self.gru2(state.g2, x)
+        x = self.res2(g2)
+        image = self.prediction(x)[..., 0]
+        return State(g1, g2), image.astype(jnp.float32)
+
+
+def step(
+    params, state: State, event_tensor: jax.Array, *, dtype=jnp.float32
+) -> tuple[State, jax.Array]:
+    """One window: (State, (B, H, W, 5)) -> (State, (B, H, W)), the same function everywhere.
+
+    event_tensor: normalised if the weights ask for it (`tensors.normalise`).
+    dtype: of the convolutions; jnp.bfloat16 trades accuracy for speed on accelerators.
+    """
+    return FireNet(dtype).apply({"params": params}, state, event_tensor)
+
+
+def initial_params(key: jax.Array):
+    """Random parameters: orthogonal gates with zero bias, PyTorch's default elsewhere."""
+    tensor = jnp.zeros((1, 8, 8, BINS))
+    return FireNet().init(key, initial_state(1, 8, 8), tensor)["params"]

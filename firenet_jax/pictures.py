@@ -1,0 +1,118 @@
+"""Images -> pictures: what people look at, by the steps of the original program (rpg_e2vid).
+
+Images are (T, B, H, W) float32 as the network gives them; pictures are (T, B, H, W) uint8, event
+pictures (T, B, H, W, 3) uint8. Sharpened by an unsharp mask, stretched from an intensity range to
+0..255, clipped and rounded. (The original truncates to 8 bits, which darkens by half a level.)
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import norm
+
+HISTORY = 11  # images whose range the automatic one is the median of
+
+
+@dataclass(frozen=True)
+class Display:
+    """How images become 8-bit pictures."""
+
+    unsharp: float = 0.3
+    """Strength of the unsharp mask; 0 switches it off."""
+    auto_range: bool = False
+    """Stretch the contrast to the range of the last 11 images instead of the fixed 0 to 1."""
+
+
+class DisplayState(NamedTuple):
+    """The ranges of the last images, the newest at the end; nan where there were none yet."""
+
+    low: jax.Array  # (B, 11) float32
+    high: jax.Array  # (B, 11) float32
+
+
+def initial_display_state(batch: int) -> DisplayState:
+    """The state before the first image."""
+    nothing = jnp.full((batch, HISTORY), jnp.nan, jnp.float32)
+    return DisplayState(nothing, nothing)
+
+
+def _unsharp_weights() -> np.ndarray:
+    """(5,) float32, whose outer product is the kernel of the original program.
+
+    Not quite a Gaussian of sigma 1: the square root of the outer product of a normal
+    distribution's masses in five cells between -1.3 and 1.3.
+    """
+    masses = np.diff(norm.cdf(np.linspace(-1.3, 1.3, 6)))
+    weights = np.sqrt(masses)
+    return (weights / weights.sum()).astype(np.float32)
+
+
+def unsharp_mask(images: jax.Array, amount: float) -> jax.Array:
+    """(..., H, W) -> (1 + amount) image - amount blurred; 5x5 kernel, zeros beyond the border."""
+    blurred = images
+    for axis in (-2, -1):
+        size = blurred.shape[axis]
+        padding = [(0, 0)] * blurred.ndim
+        padding[axis] = (2, 2)
+        padded = jnp.pad(blurred, padding)
+        blurred = sum(
+            float(weight) * jax.lax.slice_in_dim(padded, k, k + size, axis=axis)
+            for k, weight in enumerate(_unsharp_weights())
+        )
+    return (1 + amount) * images - amount * blurred
+
+
+@partial(jax.jit, static_argnames="settings")
+def display(
+    state: DisplayState,
+    images: jax.Array,
+    valid: jax.Array | None = None,
+    settings: Display = Display(),
+) -> tuple[DisplayState, jax.Array]:
+    """(DisplayState, (T, B, H, W) float32) -> (DisplayState, (T, B, H, W) uint8).
+
+    With `auto_range`, black is the median over the last 11 images of clip(min, 0, 0.45) and white
+    that of clip(max, 0.55, 1); else black is 0 and white is 1, and the state is not used.
+    valid: (T, B) bool; images that are not valid leave the state as it was. None: all are.
+    """
+    if settings.unsharp:
+        images = unsharp_mask(images, settings.unsharp)
+    if not settings.auto_range:
+        return state, _to_8_bit(images)
+    if valid is None:
+        valid = jnp.ones(images.shape[:2], bool)
+    lows = jnp.clip(images.min((-2, -1)), 0, 0.45)
+    highs = jnp.clip(images.max((-2, -1)), 0.55, 1)
+
+    def remember(state, inputs):
+        low, high, keep = inputs  # (B,) each
+        new = DisplayState(
+            jnp.append(state.low[:, 1:], low[:, None], 1),
+            jnp.append(state.high[:, 1:], high[:, None], 1),
+        )
+        state = jax.tree.map(lambda new, old: jnp.where(keep[:, None], new, old), new, state)
+        return state, (jnp.nanmedian(state.low, 1), jnp.nanmedian(state.high, 1))
+
+    state, (low, high) = jax.lax.scan(remember, state, (lows, highs, valid))
+    low, high = low[..., None, None], high[..., None, None]
+    return state, _to_8_bit((images - low) / (high - low))
+
+
+def _to_8_bit(images: jax.Array) -> jax.Array:
+    return jnp.round(jnp.clip(255 * images, 0, 255)).astype(jnp.uint8)
+
+
+def event_pictures(tensors: jax.Array) -> jax.Array:
+    """Raw event tensors (..., H, W, 5) -> (..., H, W, 3) uint8: ON blue, OFF red, else white.
+
+    The colour is that of the sign of a pixel's votes, as in the original program.
+    """
+    votes = tensors.sum(-1)[..., None]
+    white, blue, red = (
+        jnp.array(colour, jnp.uint8) for colour in ([255] * 3, [0, 0, 255], [255, 0, 0])
+    )
+    return jnp.where(votes > 0, blue, jnp.where(votes < 0, red, white))

@@ -1,0 +1,385 @@
+"""Recordings -> pictures on disk: reading, device and writing overlapped, and resumable.
+
+Recordings of one sensor size run side by side in `batch` slots, each with its own state; a slot
+whose recording has ended takes the next. The host cuts windows and writes; everything between is
+the compiled program `reconstruction.events_to_pictures`. Memory holds a few chunks, whatever the
+length of the recordings.
+"""
+
+import dataclasses
+import hashlib
+import itertools
+import json
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import jax
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from firenet_jax import filters
+from firenet_jax.checkpoint import load_weights
+from firenet_jax.events import Events, Recording, RecordingError, logger, parse_size
+from firenet_jax.network import Weights
+from firenet_jax.overlap import ahead
+from firenet_jax.pictures import Display
+from firenet_jax.readers import open_recording
+from firenet_jax.reconstruction import Network, Session, events_to_pictures, initial_session
+from firenet_jax.tensors import Packed, capacity, pack
+from firenet_jax.video import (
+    VIDEOS,
+    FolderWriter,
+    OutputError,
+    VideoWriter,
+    check_output,
+    open_writer,
+    partial_name,
+)
+from firenet_jax.windows import Window, Windows, cut
+
+RESUME_EVERY = 5.0  # seconds between two saves of what a resumed run needs
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    """Turn recordings of an event camera into video.
+
+    Examples:
+      firenet reconstruct recording.zip -o video.mp4
+      firenet reconstruct recording.raw -o frames/ --duration 20
+      firenet reconstruct a.aedat4 b.aedat4 -o videos.mp4       (videos/a.mp4, videos/b.mp4)
+    """
+
+    recordings: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="RECORDING...", help_behavior_hint=""),
+    ]
+    """Text, zip, HDF5, ECD or EVREAL folder, .bin, .dat, .raw, .aedat4, .es, ROS bag."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """A folder (for png files and timestamps.txt), or a name that ends in .mp4 or .gif. With
+    several recordings one entry each, named after them, in the folder of that name."""
+    weights: Annotated[Path | None, tyro.conf.arg(aliases=["-c"])] = None
+    """Weights: .npz, a published PyTorch checkpoint, or the folder of a training run."""
+    windows: Windows = Windows()
+    network: Network = Network()
+    display: Display = Display()
+    preview: bool = False
+    """Show the events (blue: brighter, red: darker) beside the reconstruction."""
+    hot_pixels: str | None = None
+    """Ignore these pixels: a file of `x,y` lines, or `auto` to find them in the recording."""
+    flip: bool = False
+    """Turn the picture by 180 degrees."""
+    start: float | None = None
+    """Begin this many seconds after the first event."""
+    stop: float | None = None
+    """End this many seconds after the first event."""
+    fps: float = 30.0
+    """Pictures per second of a video (windows of events have no rate of their own)."""
+    sensor_size: str | None = None
+    """WIDTHxHEIGHT of the sensor, such as 240x180, where the recording does not say it."""
+    chunk: int = 8
+    """Windows a recording gives the device at once."""
+    batch: int = 1
+    """Recordings that run side by side on the device."""
+    overwrite: bool = False
+    """Replace an output that exists."""
+
+    def __post_init__(self):
+        for name in ("chunk", "batch", "fps"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, but must be more than 0")
+        if self.network.pad < 1:
+            raise ValueError(f"pad is {self.network.pad}, but pads to a multiple of 1 or more")
+        if self.display.unsharp < 0:
+            raise ValueError(f"unsharp is {self.display.unsharp}, but must be 0 or more")
+        if not self.recordings:
+            raise ValueError("no recording: name one or more files or folders")
+        if self.stop is not None and self.stop <= (self.start or 0):
+            raise ValueError(f"stop is {self.stop} s, but must come after the start")
+
+
+class Job(NamedTuple):
+    """One recording and where its pictures go."""
+
+    recording: Recording
+    output: Path
+    record: str  # JSON of all that the pictures depend on; a resumed run must have the same
+
+
+@dataclass
+class Running:
+    """A job that has a slot."""
+
+    job: Job
+    windows: Iterator[Window]
+    ahead: Window | None  # the next window; None after the last
+    done: int  # pictures of an earlier run, already on disk
+    writer: FolderWriter | VideoWriter | None = None  # opened with the first picture
+    saved: float = field(default_factory=time.monotonic)
+
+    def take(self, count: int) -> list[Window]:
+        """The next `count` windows, or as many as there are."""
+        taken = []
+        while self.ahead is not None and len(taken) < count:
+            taken.append(self.ahead)
+            self.ahead = next(self.windows, None)
+        return taken
+
+
+class Part(NamedTuple):
+    """What a chunk holds of one recording."""
+
+    running: Running
+    times: list[int]  # of its windows, microseconds
+    ends: bool  # no windows follow
+
+
+class Chunk(NamedTuple):
+    """T x B windows on their way to the device, and whose they are."""
+
+    events: Packed
+    count: int  # events
+    valid: np.ndarray  # (T, B) bool
+    parts: dict[int, Part]  # by slot
+    starts: dict[
+        int, Session
+    ]  # slots that take a new recording here, and the state they start from
+
+
+def run(settings: Reconstruct) -> list[Path]:
+    """Does what the settings say; returns the outputs. Raises RecordingError, CheckpointError,
+    OutputError or ValueError with a message of one sentence."""
+    weights = load_weights(settings.weights)
+    outputs = plan(settings.recordings, settings.output)
+    for output in outputs:
+        check_output(output, settings.overwrite)
+    recordings = [
+        open_recording(path, parse_size(settings.sensor_size)) for path in settings.recordings
+    ]
+    jobs = [
+        Job(recording, output, describe(settings, recording, weights))
+        for recording, output in zip(recordings, outputs, strict=True)
+    ]
+    counts = [recording.count for recording in recordings]
+    partly = settings.start or settings.stop or settings.windows.step
+    known = None if None in counts or partly else sum(counts)
+    began = time.monotonic()
+    with tqdm(total=known, unit="ev", unit_scale=True, smoothing=0.1, disable=None) as progress:
+        total = [
+            reconstruct_jobs(same, settings, weights, progress) for same in by_sensor_size(jobs)
+        ]
+    seconds = time.monotonic() - began
+    shown, events = (sum(column) for column in zip(*total, strict=True))
+    print(
+        f"{', '.join(map(str, outputs))}: {shown} pictures of {events:,} events in {seconds:.1f} s "
+        f"({shown / seconds:.1f} pictures/s, {events / seconds / 1e6:.2f} Mev/s)"
+    )
+    return outputs
+
+
+def plan(recordings: tuple[Path, ...], output: Path) -> list[Path]:
+    """The name of each recording's output: `output` itself if there is only one recording."""
+    if len(recordings) == 1:
+        return [output]
+    stems = [path.resolve().stem for path in recordings]
+    twice = next((stem for stem in stems if stems.count(stem) > 1), None)
+    if twice:
+        raise OutputError(
+            f"two recordings are named {twice} and would write the same output: run them apart"
+        )
+    if output.suffix in VIDEOS:
+        return [output.with_suffix("") / f"{stem}{output.suffix}" for stem in stems]
+    return [output / stem for stem in stems]
+
+
+def by_sensor_size(jobs: list[Job]) -> list[list[Job]]:
+    """Only recordings of the same size can share a batch."""
+    groups: dict[tuple[int, int], list[Job]] = {}
+    for job in jobs:
+        groups.setdefault((job.recording.height, job.recording.width), []).append(job)
+    return list(groups.values())
+
+
+def reconstruct_jobs(
+    jobs: list[Job], settings: Reconstruct, weights: Weights, progress: tqdm
+) -> tuple[int, int]:
+    """Jobs of one sensor size -> their outputs on disk; returns (pictures, events) done."""
+    height, width = jobs[0].recording.height, jobs[0].recording.width
+    slots = min(settings.batch, len(jobs))
+    weights = jax.device_put(weights)
+    chunks = ahead(in_chunks(jobs, settings, slots))
+
+    def device():
+        session = initial_session(slots, height, width, settings.network)
+        for chunk in chunks:
+            for slot, start in chunk.starts.items():
+                session = _set_slot(session, slot, start)
+            session, shown = events_to_pictures(
+                weights, session, chunk.events, chunk.valid, height=height, width=width,
+                network=settings.network, settings=settings.display, preview=settings.preview,
+            )  # fmt: skip
+            yield chunk, session, shown
+
+    pictures_done = events_done = 0
+    writing: dict[int, Running] = {}
+    finished = ahead(device(), depth=1)
+    try:
+        for chunk, session, shown in finished:
+            shown = np.asarray(shown)  # waits for the device, which is then one chunk ahead
+            for slot, (running, times, ends) in chunk.parts.items():
+                if running.writer is None:
+                    running.writer = open_writer(running.job.output, settings.fps, running.done)
+                    writing[slot] = running
+                for picture, time_of in zip(shown[:, slot], times, strict=False):
+                    running.writer.write(picture, time_of)
+                pictures_done += len(times)
+                if ends:
+                    del writing[slot]
+                    if isinstance(running.writer, FolderWriter):
+                        position_file(running.job).unlink(missing_ok=True)
+                    running.writer.finish()
+                elif time.monotonic() - running.saved > RESUME_EVERY:
+                    save_position(running, _get_slot(session, slot))
+            events_done += chunk.count
+            progress.update(chunk.count)
+            progress.set_postfix_str(f"{pictures_done} pictures", refresh=False)
+    finally:
+        finished.close()
+        for running in writing.values():
+            running.writer.abandon()
+    return pictures_done, events_done
+
+
+@jax.jit
+def _set_slot(session: Session, slot, start: Session) -> Session:
+    return jax.tree.map(lambda all, one: all.at[slot].set(one), session, start)
+
+
+@jax.jit
+def _get_slot(session: Session, slot) -> Session:
+    return jax.tree.map(lambda all: all[slot], session)
+
+
+def in_chunks(jobs: list[Job], settings: Reconstruct, slots: int) -> Iterator[Chunk]:
+    """Jobs -> chunks of T x B windows; a free slot takes the next job."""
+    waiting = iter(jobs)
+    running: dict[int, Running] = {}
+    size = 0
+    while True:
+        starts = {}
+        for slot in range(slots):
+            job = None if slot in running else next(waiting, None)
+            if job is not None:
+                running[slot], starts[slot] = start(job, settings)
+        if not running:
+            return
+        rows = [[Events.empty()] * slots for _ in range(settings.chunk)]
+        valid = np.zeros((settings.chunk, slots), bool)
+        parts = {}
+        for slot, job in list(running.items()):
+            windows = job.take(settings.chunk)
+            for t, window in enumerate(windows):
+                rows[t][slot] = window.events
+            valid[: len(windows), slot] = True
+            parts[slot] = Part(job, [window.time for window in windows], job.ahead is None)
+            if job.ahead is None:
+                del running[slot]
+        count = sum(len(events) for row in rows for events in row)
+        size = capacity(count, size)
+        yield Chunk(pack(rows, size), count, valid, parts, starts)
+
+
+def start(job: Job, settings: Reconstruct) -> tuple[Running, Session]:
+    """Opens the stream of a job's windows, after those that an interrupted run has finished."""
+    recording = job.recording
+    chunks = recording.events()
+    if settings.start is not None or settings.stop is not None:
+        chunks = filters.between(chunks, settings.start, settings.stop)
+    if settings.hot_pixels is not None:
+        chunks = filters.without(chunks, hot_pixels(settings.hot_pixels, recording))
+    if settings.flip:
+        chunks = filters.turned(chunks, recording.height, recording.width)
+    windows = cut(recording, settings.windows, chunks)
+    done, session = load_position(job, settings)
+    first = next(itertools.islice(windows, done, None), None)
+    if first is None and not done:
+        raise RecordingError(f"{recording.path}: no events, or none that the filters let pass")
+    return Running(job, windows, first, done), session
+
+
+def hot_pixels(choice: str, recording: Recording) -> np.ndarray:
+    """`auto` or the name of a file -> (H, W) bool."""
+    if choice == "auto":
+        hot = filters.find_hot_pixels(recording)
+        logger.warning("%s: %d hot pixels are ignored", recording.path, hot.sum())
+        return hot
+    return filters.read_hot_pixels(choice, recording.height, recording.width)
+
+
+def describe(settings: Reconstruct, recording: Recording, weights: Weights) -> str:
+    """All that the pictures depend on, as JSON."""
+    digest = hashlib.sha256(str(weights.normalise).encode())
+    for path, leaf in jax.tree_util.tree_leaves_with_path(weights.params):
+        digest.update(jax.tree_util.keystr(path).encode() + np.asarray(leaf).tobytes())
+    status = recording.path.stat()
+    choices = dataclasses.asdict(settings)
+    for name in ("recordings", "output", "weights", "fps", "chunk", "batch", "overwrite"):
+        del choices[name]
+    return json.dumps(
+        {
+            "recording": [recording.path.name, status.st_size, status.st_mtime_ns],
+            "sensor": [recording.height, recording.width],
+            "weights": digest.hexdigest(),
+            **choices,
+        }
+    )
+
+
+def position_file(job: Job) -> Path:
+    return partial_name(job.output) / "resume.npz"
+
+
+def save_position(running: Running, session: Session) -> None:
+    """Keeps beside the partial output what is needed to go on from here; only folders can."""
+    running.saved = time.monotonic()
+    if not isinstance(running.writer, FolderWriter):
+        return
+    running.writer.flush()
+    path = position_file(running.job)
+    beside = path.with_suffix(".new.npz")
+    leaves = {f"state{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(session))}
+    np.savez(beside, record=running.job.record, pictures=running.writer.count, **leaves)
+    os.replace(beside, path)
+
+
+def load_position(job: Job, settings: Reconstruct) -> tuple[int, Session]:
+    """(pictures on disk, the state after them) of an interrupted run; (0, the initial state) if
+    there is none."""
+    height, width = job.recording.height, job.recording.width
+    initial = initial_session(1, height, width, settings.network)
+    initial = jax.tree.map(lambda leaf: leaf[0], initial)
+    path = position_file(job)
+    if job.output.suffix in VIDEOS or not path.exists():
+        return 0, initial
+    try:
+        with np.load(path, allow_pickle=False) as saved:
+            record, done = str(saved["record"]), int(saved["pictures"])
+            leaves, tree = jax.tree.flatten(initial)
+            leaves = [saved[f"state{i}"] for i in range(len(leaves))]
+    except (OSError, ValueError, KeyError) as error:
+        raise OutputError(f"{path} is damaged ({error}): remove {path.parent}") from error
+    if record == job.record:
+        logger.warning("%s: going on after %d pictures", job.output, done)
+        return done, jax.tree.unflatten(tree, leaves)
+    if not settings.overwrite:
+        raise OutputError(
+            f"{path.parent} holds an unfinished run of other settings or another recording: "
+            "remove it or pass --overwrite"
+        )
+    path.unlink()
+    return 0, initial

@@ -1,0 +1,225 @@
+"""A path -> Recording: every format of the field as one stream of `Events` chunks.
+
+A format is one module of this package with two functions:
+
+    matches(path: Path) -> bool                    is it mine? Cheap: name, first bytes
+    read(path: Path) -> Source                     what the file says, nothing checked yet
+
+and a line in `FORMATS` below. A module raises RecordingError, in one sentence that names the file
+and the place, for what it cannot read; checks that all formats share (order of time, coordinates)
+are made here, by `events.checked`. Optional libraries are imported inside `read`, by `extra`. The
+functions below `open_recording` are what the modules share.
+"""
+
+import importlib
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from firenet_jax.events import (
+    Events,
+    Frames,
+    Recording,
+    RecordingError,
+    checked,
+    concatenate,
+    event_number,
+    logger,
+)
+
+# In the order in which they are asked.
+FORMATS = ("ecd", "npy", "rosbag", "hdf5", "text", "ncaltech", "dat", "camera")
+
+CHUNK = 1 << 20  # events a reader yields at once: 13 MB as Events
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a format module reads out of a file; `open_recording` turns it into a Recording."""
+
+    format: str  # in words: "text", "HDF5 (event_cnn_minimal)"
+    events: Callable[[], Iterator[Events]]  # unchecked chunks, at most about CHUNK events each
+    size: tuple[int, int] | None = None  # (height, width) where the file says it
+    count: int | None = None  # number of events where the file says it
+    frames: Frames | None = None
+    place: Callable[[int], str] = event_number  # row, from 0 -> its name in the file: "line 7"
+
+
+def open_recording(path: str | Path, sensor_size: tuple[int, int] | None = None) -> Recording:
+    """A recording of any known format -> Recording, opened but not read.
+
+    sensor_size: (height, width) in pixels. Without it the file's own is taken; where the file
+    names none it is inferred by reading the events once, and a notice says so.
+    Raises RecordingError for a missing, empty, unknown or damaged file; damage further on in the
+    file raises it when the events get there.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise RecordingError(f"{path}: there is no such file or folder: check the path")
+    if path.is_file() and path.stat().st_size == 0:
+        raise RecordingError(f"{path}: the file is empty: copy or download it again")
+    for name in FORMATS:
+        module = importlib.import_module(f"{__name__}.{name}")
+        if module.matches(path):
+            source = module.read(path)
+            break
+    else:
+        raise RecordingError(
+            f"{path}: not a recording of a known format: expected text or zip, an ECD or EVREAL "
+            "folder, HDF5, N-Caltech101 .bin, .dat, .raw, .aedat4, .es, or a ROS bag"
+        )
+    height, width = sensor_size or source.size or _infer_size(path, source)
+    return Recording(
+        path=path,
+        format=source.format,
+        height=int(height),
+        width=int(width),
+        events=lambda: checked(source.events(), path, height, width, source.place),
+        count=source.count,
+        frames=source.frames,
+    )
+
+
+def _infer_size(path: Path, source: Source) -> tuple[int, int]:
+    """Reads all events for the largest coordinates: no file of this format names its sensor."""
+    height = width = 0
+    for events in checked(source.events(), path, None, None, source.place):
+        height = max(height, int(events.y.max()) + 1)
+        width = max(width, int(events.x.max()) + 1)
+    if not height:
+        raise RecordingError(
+            f"{path}: holds no events: check that it was recorded and copied whole"
+        )
+    logger.warning(
+        "%s names no sensor size; %dx%d inferred from its events; "
+        "--sensor-size WIDTHxHEIGHT sets another and saves this pass over the file",
+        path, width, height,
+    )  # fmt: skip
+    return height, width
+
+
+def in_chunks(read: Callable[[slice], Events], count: int) -> Iterator[Events]:
+    """Random access -> chunks: for formats whose rows can be sliced."""
+    for start in range(0, count, CHUNK):
+        yield read(slice(start, min(start + CHUNK, count)))
+
+
+def joined(chunks: Iterable[Events], least: int = CHUNK // 4) -> Iterator[Events]:
+    """Tiny chunks -> chunks of at least so many events: for formats made of packets."""
+    waiting, count = [], 0
+    for events in chunks:
+        waiting.append(events)
+        count += len(events)
+        if count >= least:
+            yield concatenate(waiting)
+            waiting, count = [], 0
+    if count:
+        yield concatenate(waiting)
+
+
+def microseconds(seconds: np.ndarray) -> np.ndarray:
+    """float64 seconds -> int64 microseconds, to the nearest one (exact up to 285 years)."""
+    return np.rint(np.asarray(seconds, np.float64) * 1e6).astype(np.int64)
+
+
+LATEST = 2**53  # microseconds, 285 years: float64 seconds lose microseconds beyond
+REACH = 2**15  # coordinates are int16
+
+
+def to_events(
+    path: Path, row: int, t, x, y, p, place: Callable[[int], str] = event_number
+) -> Events:
+    """Columns as a file holds them -> Events; refuses what those cannot hold, naming the row.
+
+    t: microseconds where integer, seconds where floating; p: bool, 0 and 1, or -1 and 1.
+    row: the number of the first row in the recording, for `place`.
+    """
+    t, x, y, p = (np.asarray(column) for column in (t, x, y, p))
+    if not t.size:
+        return Events.empty()
+
+    def refuse(bad: np.ndarray, column: np.ndarray, name: str, expected: str):
+        first = int(np.argmax(bad))
+        raise RecordingError(
+            f"{path}, {place(row + first)}: {name} is {column[first]}, {expected}: "
+            "the file is damaged or of another format"
+        )
+
+    for name, column in (("the time", t), ("x", x), ("y", y), ("the polarity", p)):
+        if column.dtype.kind not in "biuf":
+            raise RecordingError(f"{path}: {name} is stored as {column.dtype}, expected numbers")
+    latest = LATEST / 1e6 if t.dtype.kind == "f" else LATEST
+    if not (-latest < t.min() and t.max() < latest):  # so put that NaN fails
+        refuse(~(np.abs(t) < latest), t, "the time", "expected seconds or whole microseconds")
+    for name, column in (("x", x), ("y", y)):
+        if column.dtype.kind == "f" and (column != np.rint(column)).any():  # so does NaN
+            refuse(column != np.rint(column), column, name, "expected a whole number of pixels")
+        if not (-REACH <= column.min() and column.max() < REACH):
+            bad = (column < -REACH) | (column >= REACH)
+            refuse(bad, column, name, f"expected a coordinate below {REACH}")
+    if p.dtype.kind != "b":
+        if p.dtype.kind == "f" or p.min() < -1 or p.max() > 1:
+            bad = ~np.isin(p, (-1, 0, 1))
+            if bad.any():
+                refuse(bad, p, "the polarity", "expected 0 or 1 (or -1 or 1)")
+        p = p > 0
+    return Events.of(microseconds(t) if t.dtype.kind == "f" else t, x, y, p)
+
+
+def to_frame(picture: np.ndarray, path: Path) -> np.ndarray:
+    """A picture as a file holds it, grey or RGB, 8 or 16 bit -> (H, W) uint8."""
+    picture = np.asarray(picture)
+    if picture.ndim == 3 and picture.shape[-1] == 1:
+        picture = picture[..., 0]
+    if picture.dtype == np.uint16:
+        picture = (picture >> 8).astype(np.uint8)
+    if picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[-1] in (3, 4):
+        luma = picture[..., :3] @ np.array([0.299, 0.587, 0.114])  # ITU-R BT.601
+        picture = np.rint(luma).astype(np.uint8)
+    if picture.dtype != np.uint8 or picture.ndim != 2:
+        raise RecordingError(
+            f"{path}: a frame is {picture.dtype} of shape {picture.shape}, expected grey or RGB "
+            "pictures of 8 bits"
+        )
+    return picture
+
+
+def unwrap(counter: np.ndarray, bits: int, last: int) -> np.ndarray:
+    """A counter that starts again from 0 after 2^bits -> int64 that keeps growing.
+
+    last: its unwrapped value just before. Falls of more than half its range are wraps; smaller
+    ones are left as they are, for `events.checked` to judge.
+    """
+    counter = np.asarray(counter, np.int64)
+    falls = np.diff(counter, prepend=last & ((1 << bits) - 1)) < -(1 << (bits - 1))
+    return counter + (((last >> bits) + np.cumsum(falls)) << bits)
+
+
+def extra(module: str, path: Path) -> ModuleType:
+    """The optional library that this file needs, or a RecordingError that says how to get it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise RecordingError(
+            f"{path}: reading this format needs {module.split('.')[0]}: "
+            'pip install "firenet-jax[formats]"'
+        ) from error
+
+
+@contextmanager
+def reading(path: Path, *errors: type[BaseException]):
+    """What libraries raise for a damaged file becomes a RecordingError that names it."""
+    try:
+        yield
+    except RecordingError:
+        raise
+    except errors as error:
+        found = " ".join(str(error).split()) or type(error).__name__
+        raise RecordingError(
+            f"{path}: cannot be read ({found}): the file is damaged, incomplete or of another "
+            "format: copy or download it again"
+        ) from error

@@ -1,0 +1,94 @@
+"""Prophesee DAT -> Source: lines of text, two bytes, then 8 bytes an event, little-endian.
+
+% Version 2           header: lines that start with %; Width and Height may be missing
+% Width 304
+1 byte type           0x00 (2d) or 0x0C (contrast detection): events, in the same layout
+1 byte size           8
+uint32                time, microseconds; starts again from 0 after 71.6 minutes
+uint32                version 2: x bits 0-13, y bits 14-27, polarity bit 28
+                      version 1: x bits 0-8,  y bits 9-16,  polarity bit 17
+"""
+
+import re
+from collections.abc import Iterator
+from io import BufferedReader
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from firenet_jax.events import Events, RecordingError
+from firenet_jax.readers import CHUNK, Source, to_events, unwrap
+
+TYPES = (0x00, 0x0C)
+
+
+class Layout(NamedTuple):
+    x_bits: int
+    y_bits: int
+
+
+VERSIONS = {0: Layout(9, 8), 1: Layout(9, 8), 2: Layout(14, 14)}
+
+
+def matches(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() == ".dat"
+
+
+def read(path: Path) -> Source:
+    with open(path, "rb") as file:
+        header = read_header(file)
+        kind = file.read(2)
+        start = file.tell()
+    if not header or len(kind) < 2:
+        raise RecordingError(f"{path}: has no header of lines that start with %: it is no DAT file")
+    if kind[0] not in TYPES or kind[1] != 8:
+        raise RecordingError(
+            f"{path}: holds entries of type 0x{kind[0]:02X} and {kind[1]} bytes, expected 0x00 or "
+            "0x0C, which are events, and 8"
+        )
+    version = re.search(r"^% Version (\d+)", header, re.M)
+    version = int(version[1]) if version else 0
+    if version not in VERSIONS:
+        raise RecordingError(f"{path}: is of version {version}, expected 0, 1 or 2")
+    count, left = divmod(path.stat().st_size - start, 8)
+    if left:
+        raise RecordingError(
+            f"{path}: ends within an event: the file is cut off: copy or download it again"
+        )
+    layout = VERSIONS[version]
+    size = header_size(header)
+    return Source("Prophesee DAT", lambda: _events(path, start, layout), size, count)
+
+
+def read_header(file: BufferedReader) -> str:
+    """The lines that start with %, up to `% end` if there is one; leaves the file behind them."""
+    header = ""
+    while file.peek(1)[:1] == b"%":
+        line = file.readline(1 << 16).decode("latin-1")
+        header += line
+        if line.strip() == "% end":
+            break
+    return header
+
+
+def header_size(header: str) -> tuple[int, int] | None:
+    """`% geometry 640x480`, `% format EVT3;height=480;width=640`, or `% Width 640` -> (480, 640)"""
+    if match := re.search(r"geometry[ =:](\d+)x(\d+)", header, re.I):
+        return int(match[2]), int(match[1])
+    height, width = (re.search(rf"\b{side}[ =](\d+)", header, re.I) for side in ("height", "width"))
+    return (int(height[1]), int(width[1])) if height and width else None
+
+
+def _events(path: Path, start: int, layout: Layout) -> Iterator[Events]:
+    row, last = 0, 0
+    with open(path, "rb") as file:
+        file.seek(start)
+        while data := file.read(8 * CHUNK):
+            t, fields = np.frombuffer(data, "<u4").reshape(-1, 2).T
+            t = unwrap(t, 32, last)
+            x = fields & ((1 << layout.x_bits) - 1)
+            y = fields >> layout.x_bits & ((1 << layout.y_bits) - 1)
+            p = fields >> (layout.x_bits + layout.y_bits) & 1
+            yield to_events(path, row, t, x, y, p)
+            row, last = row + len(t), int(t[-1])

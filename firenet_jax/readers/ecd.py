@@ -1,0 +1,97 @@
+"""ECD folder -> Source: a sequence of the Event Camera Dataset, unpacked or as its zip.
+
+    events.txt       a line an event: t x y p, seconds (see text.py)
+    images.txt       a line a frame: t filename, seconds on the same clock
+    images/          frames, grey
+    calib.txt, imu.txt, groundtruth.txt are not read
+
+The files name no sensor size: it is that of the first frame, and unknown where there are no frames.
+"""
+
+import io
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from firenet_jax.events import Frames, RecordingError, logger
+from firenet_jax.readers import Source, microseconds, reading, text, to_frame
+
+
+def matches(path: Path) -> bool:
+    if path.is_dir():
+        return (path / "events.txt").is_file()
+    return path.suffix.lower() == ".zip" and _folder_in(path) is not None
+
+
+def read(path: Path) -> Source:
+    if path.is_dir():
+        source = text.read(path / "events.txt")
+    else:
+        source = text.read(path, _folder_in(path) + "events.txt")
+    frames = _frames(path)
+    size = frames.read(0).shape if frames and source.size is None else source.size
+    return replace(
+        source,
+        format="ECD folder" if path.is_dir() else "ECD zip",
+        size=size,
+        frames=frames,
+        place=lambda row: f"events.txt, {source.place(row)}",
+    )
+
+
+def _folder_in(path: Path) -> str | None:
+    """The folder inside a zip that holds events.txt and images.txt, with its slash."""
+    try:
+        names = text.members(path)
+    except RecordingError:
+        return None  # not a zip: text.py says so
+    folders = [name.removesuffix("events.txt") for name in names if name.endswith("events.txt")]
+    folders = [name for name in folders if not name or name.endswith("/")]
+    return next((name for name in folders if name + "images.txt" in names), None)
+
+
+def _bytes(path: Path, name: str) -> bytes:
+    if path.is_dir():
+        return (path / name).read_bytes()
+    with text.opened(path, _folder_in(path) + name) as stream:
+        return stream.read()
+
+
+def _frames(path: Path) -> Frames | None:
+    if path.is_dir() and not (path / "images.txt").is_file():
+        return None
+    times, names = [], []
+    lines = _bytes(path, "images.txt").decode("utf-8", "replace").splitlines()
+    for number, line in enumerate(lines, 1):
+        words = line.split()
+        if not words or line.startswith("#"):
+            continue
+        try:
+            time, name = words
+            times.append(float(time))
+        except ValueError:
+            times.append(math.nan)
+        if not math.isfinite(times[-1]):
+            raise RecordingError(
+                f"{path}, images.txt, line {number}: {line.strip()!r} where a time in seconds "
+                "and the name of a picture are expected"
+            )
+        names.append(name)
+    if not names:
+        return None
+    try:
+        _bytes(path, names[0])
+    except (OSError, KeyError):
+        logger.warning("%s: images.txt names %s, which is not there: no frames", path, names[0])
+        return None
+    return Frames(microseconds(np.array(times)), lambda i: _frame(path, names[i]))
+
+
+def _frame(path: Path, name: str) -> np.ndarray:
+    # KeyError: not in the zip; OSError: not in the folder, or not a picture
+    with reading(path / name, OSError, KeyError, SyntaxError):
+        with Image.open(io.BytesIO(_bytes(path, name))) as picture:
+            return to_frame(np.asarray(picture.convert("L")), path)

@@ -1,0 +1,139 @@
+"""HDF5 -> Source: the layouts of event_cnn_minimal, DSEC and MVSEC.
+
+    event_cnn_minimal   events/{xs, ys, ts, ps}; images/image%09d with attribute `timestamp`;
+                        root attribute `sensor_resolution` (H, W)
+    DSEC                events/{x, y, t, p}, t in microseconds after `t_offset`; compressed (blosc)
+    MVSEC               davis/left/events, rows x, y, t, p with p -1 or 1;
+                        davis/left/{image_raw, image_raw_ts}
+
+Times are microseconds where they are integers, seconds where they are floating. The file is opened
+anew by every pass over the events and for every frame, and read in slices.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from firenet_jax.events import Events, Frames, RecordingError
+from firenet_jax.readers import Source, extra, in_chunks, microseconds, reading, to_events, to_frame
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+COLUMNS = {"event_cnn_minimal": ("ts", "xs", "ys", "ps"), "DSEC": ("t", "x", "y", "p")}
+MVSEC = "davis/left"
+
+
+def matches(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    if path.suffix.lower() in (".h5", ".hdf5", ".hdf"):
+        return True
+    with open(path, "rb") as file:
+        return file.read(8) == SIGNATURE
+
+
+def read(path: Path) -> Source:
+    with _opened(path) as file:
+        layout = _layout(path, file)
+        _, count = _reader(path, file, layout)
+        frames = _frames(path, file, layout)
+        size = file.attrs.get("sensor_resolution")
+    if size is not None:
+        size = tuple(int(side) for side in np.ravel(size)[:2])
+    elif frames is not None:
+        size = frames.read(0).shape
+    return Source(f"HDF5 ({layout})", lambda: _events(path, layout), size, count, frames)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[h5py.File]:
+    with reading(path, OSError, RuntimeError, KeyError), h5py.File(path, "r") as file:
+        yield file
+
+
+def _layout(path: Path, file: h5py.File) -> str:
+    events = file.get("events")
+    if isinstance(events, h5py.Group):
+        for layout, names in COLUMNS.items():
+            if all(name in events for name in names):
+                return layout
+    if f"{MVSEC}/events" in file:
+        return "MVSEC"
+    found = [*file, *(f"events/{name}" for name in events or () if isinstance(events, h5py.Group))]
+    raise RecordingError(
+        f"{path}: holds {', '.join(found) or 'nothing'}, expected the columns events/xs, ys, ts, "
+        "ps (event_cnn_minimal), events/x, y, t, p (DSEC), or davis/left/events (MVSEC)"
+    )
+
+
+def _reader(path: Path, file: h5py.File, layout: str) -> tuple[Callable[[slice], Events], int]:
+    """(rows -> Events, number of rows)"""
+    if layout == "MVSEC":
+        events = file[f"{MVSEC}/events"]
+        _check_filters(path, events)
+        if events.ndim != 2 or events.shape[1] != 4:
+            raise RecordingError(
+                f"{path}: {MVSEC}/events has the shape {events.shape}, expected (N, 4)"
+            )
+
+        def read(rows: slice) -> Events:
+            x, y, t, p = events[rows].T
+            return to_events(path, rows.start, t, x, y, p)
+
+        return read, len(events)
+
+    columns = [file["events"][name] for name in COLUMNS[layout]]
+    for column in columns:
+        _check_filters(path, column)
+    if len({column.shape for column in columns}) != 1 or columns[0].ndim != 1:
+        found = ", ".join(f"{column.name} {column.shape}" for column in columns)
+        raise RecordingError(f"{path}: its columns differ in length: {found}")
+    start = int(file["t_offset"][()]) if "t_offset" in file and layout == "DSEC" else 0
+
+    def read(rows: slice) -> Events:
+        t, x, y, p = (column[rows] for column in columns)
+        if start and t.dtype.kind in "iu":
+            t = t.astype(np.int64) + start
+        return to_events(path, rows.start, t, x, y, p)
+
+    return read, len(columns[0])
+
+
+def _check_filters(path: Path, data: h5py.Dataset):
+    """Compression that h5py lacks comes with hdf5plugin, which adds it when imported."""
+    created = data.id.get_create_plist()
+    for number in (created.get_filter(i)[0] for i in range(created.get_nfilters())):
+        if not h5py.h5z.filter_avail(number):
+            extra("hdf5plugin", path)
+
+
+def _events(path: Path, layout: str) -> Iterator[Events]:
+    with _opened(path) as file:
+        yield from in_chunks(*_reader(path, file, layout))
+
+
+def _frames(path: Path, file: h5py.File, layout: str) -> Frames | None:
+    if layout == "MVSEC":
+        if f"{MVSEC}/image_raw" not in file:
+            return None
+        times = file[f"{MVSEC}/image_raw_ts"][:]
+        return Frames(_times(path, times), lambda i: _frame(path, f"{MVSEC}/image_raw", i))
+    if layout == "DSEC" or not len(file.get("images", ())):
+        return None
+    names = sorted(file["images"])
+    times = np.array([file["images"][name].attrs["timestamp"] for name in names])
+    return Frames(_times(path, times), lambda i: _frame(path, f"images/{names[i]}", ...))
+
+
+def _times(path: Path, times: np.ndarray) -> np.ndarray:
+    if not np.isfinite(times).all():
+        frame = int(np.argmin(np.isfinite(times)))
+        raise RecordingError(f"{path}, frame {frame + 1}: its time is {times[frame]}")
+    return times.astype(np.int64) if times.dtype.kind in "iu" else microseconds(times)
+
+
+def _frame(path: Path, name: str, index) -> np.ndarray:
+    with _opened(path) as file:
+        return to_frame(file[name][index], path)

@@ -1,0 +1,51 @@
+"""N-Caltech101 and N-MNIST .bin -> Source: 40 bits an event, big-endian, nothing else in the file.
+
+    byte 0      column
+    byte 1      row
+    byte 2      bit 7: polarity, 1 is ON; bits 6 to 0: bits 22 to 16 of the time
+    bytes 3, 4  bits 15 to 0 of the time, microseconds
+
+Row 240 lies below the sensor (ATIS, 304x240): such an entry is no event but a mark of the clock,
+behind which all times move on by 2^13 microseconds; so does the reader of the data set's author.
+The file names no sensor size.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from firenet_jax.events import Events, RecordingError
+from firenet_jax.readers import CHUNK, Source, to_events
+
+MARK = 240
+STEP = 2**13
+
+
+def matches(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() == ".bin"
+
+
+def read(path: Path) -> Source:
+    size = path.stat().st_size
+    if size % 5:
+        raise RecordingError(
+            f"{path}: has {size} bytes, expected a multiple of 5: the file is cut off or of "
+            "another format"
+        )
+    return Source("N-Caltech101", lambda: _events(path))
+
+
+def _events(path: Path) -> Iterator[Events]:
+    row, marks = 0, 0
+    with open(path, "rb") as file:
+        while data := file.read(5 * CHUNK):
+            x, y, high, middle, low = np.frombuffer(data, np.uint8).reshape(-1, 5).T
+            t = (high & 0x7F).astype(np.int64) << 16 | middle.astype(np.int64) << 8 | low
+            is_mark = y == MARK
+            t += STEP * (marks + np.cumsum(is_mark))
+            marks += int(is_mark.sum())
+            columns = (column[~is_mark] for column in (t, x, y, high >> 7))
+            events = to_events(path, row, *columns)
+            row += len(events)
+            yield events

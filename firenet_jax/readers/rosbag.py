@@ -1,0 +1,265 @@
+"""ROS bag -> Source, through rosbags (no ROS needed): ROS 1 .bag, ROS 2 folder, .mcap or .db3.
+
+    dvs_msgs/EventArray             header, height, width, events (x, y, time, polarity)
+    prophesee_event_msgs/EventArray the same
+    event_camera_msgs/EventPacket   header, height, width, seq, time_base, encoding, is_bigendian,
+    (once event_array_msgs/EventArray)   events: bytes, of which these encodings are read:
+        evt3    16-bit words (evt3.py)
+        mono    64 bits: nanoseconds after time_base (bits 0-31), x (32-47), y (48-62), polarity
+    sensor_msgs/Image               frames: mono8, rgb8, bgr8, mono16
+
+Times are microseconds of the ROS clock. EventPackets carry the sensor's own clock: the first event
+is put at the time in its message's header, so events and frames agree but for the transport.
+Messages are decoded from their bytes: ROS 1 packs fields, ROS 2 (CDR) aligns each to its size.
+"""
+
+from collections.abc import Iterator
+from itertools import chain
+from os.path import commonprefix
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from firenet_jax.events import Events, Frames, RecordingError, logger
+from firenet_jax.readers import Source, evt3, extra, joined, reading, to_events, to_frame
+
+ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
+PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
+IMAGE = "sensor_msgs/msg/Image"
+WORDS = 1 << 18  # EVT3 words decoded at once: messages are tiny
+CHANNELS = {"mono8": 1, "8UC1": 1, "mono16": 1, "16UC1": 1, "rgb8": 3, "bgr8": 3}
+
+
+def matches(path: Path) -> bool:
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    return path.suffix.lower() in (".bag", ".mcap", ".db3")
+
+
+def read(path: Path) -> Source:
+    with reading(path, Exception), _bag(path) as bag:
+        topics = {entry.topic: entry.msgtype for entry in bag.connections}
+        topic = _only(path, [t for t, kind in topics.items() if kind in ARRAYS + PACKETS], topics)
+        size = next((_size(path, raw) for _, raw in _raw(bag, topic)), None)
+        images = [t for t, kind in topics.items() if kind == IMAGE]
+        # Of several cameras' images, those of the same name: /dvs/events, /dvs/image_raw.
+        image_topic = max(images, key=lambda name: len(commonprefix([name, topic])), default=None)
+        frames = _frames(path, bag, image_topic)
+    return Source(
+        "ROS 1 bag" if _is_ros1(path) else "ROS 2 bag",
+        lambda: joined(_events(path, topic, topics[topic] in ARRAYS)),
+        size,
+        frames=frames,
+    )
+
+
+def _is_ros1(path: Path) -> bool:
+    return path.suffix.lower() == ".bag" and path.is_file()
+
+
+def _bag(path: Path):
+    return extra("rosbags.rosbag1" if _is_ros1(path) else "rosbags.rosbag2", path).Reader(path)
+
+
+def _only(path: Path, found: list[str], topics: dict[str, str]) -> str:
+    if not found:
+        listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
+        raise RecordingError(
+            f"{path}: holds no topic of events ({', '.join((*ARRAYS, *PACKETS))}), but "
+            f"{listed or 'nothing'}"
+        )
+    if len(found) > 1:
+        logger.warning("%s: topics %s hold events; reading %s", path, ", ".join(found), found[0])
+    return found[0]
+
+
+def _raw(bag, topic: str, start: int | None = None) -> Iterator[tuple[int, bytes]]:
+    """(time of recording, bytes) of every message of a topic"""
+    connections = [entry for entry in bag.connections if entry.topic == topic]
+    for _, time, raw in bag.messages(connections, start):
+        yield time, raw
+
+
+class _Message:
+    """The fields of a serialised message, in their order."""
+
+    def __init__(self, path: Path, raw: bytes):
+        self.raw, self.ros2 = raw, not _is_ros1(path)
+        self.at = self.start = 4 if self.ros2 else 0  # CDR tells its byte order first
+        self.order = "big" if self.ros2 and raw[1] == 0 else "little"
+
+    def number(self, size: int) -> int:
+        if self.ros2:
+            self.at += -(self.at - self.start) % size
+        self.at += size
+        if self.at > len(self.raw):
+            raise ValueError("a message ends too early")
+        return int.from_bytes(self.raw[self.at - size : self.at], self.order)
+
+    def bytes(self) -> bytes:
+        size = self.number(4)
+        self.at += size
+        if self.at > len(self.raw):
+            raise ValueError("a message ends too early")
+        return self.raw[self.at - size : self.at]
+
+    def text(self) -> str:
+        return bytes(self.bytes()).rstrip(b"\0").decode()
+
+    def header(self) -> int:
+        """-> time in microseconds"""
+        if not self.ros2:
+            self.number(4)  # a count of messages
+        seconds, nanoseconds = self.number(4), self.number(4)
+        self.text()  # name of the coordinate frame
+        return _microseconds(seconds, nanoseconds)
+
+
+def _microseconds(seconds, nanoseconds):
+    return seconds * 1_000_000 + (nanoseconds + 500) // 1000
+
+
+def _size(path: Path, raw: bytes) -> tuple[int, int]:
+    message = _Message(path, raw)
+    message.header()
+    return message.number(4), message.number(4)
+
+
+def _events(path: Path, topic: str, arrays: bool) -> Iterator[Events]:
+    row = 0
+    with reading(path, Exception), _bag(path) as bag:
+        messages = (_Message(path, raw) for _, raw in _raw(bag, topic))
+        for columns in _array_columns(messages) if arrays else _packet_columns(path, messages):
+            events = to_events(path, row, *columns)
+            row += len(events)
+            yield events
+
+
+def _array_columns(messages: Iterator[_Message]) -> Iterator[tuple[np.ndarray, ...]]:
+    for message in messages:
+        message.header()
+        _, _, count = message.number(4), message.number(4), message.number(4)
+        o = ">" if message.order == "big" else "<"
+        if message.ros2:
+            # An event takes 2+2+4+4+1 bytes and is aligned to 2, its time to 4: behind the first
+            # that makes 16 bytes from time to time, with x and y in the 6 bytes before.
+            names, offsets = ("s", "n", "p", "next_x", "next_y"), (4, 8, 12, 14, 16)
+            kinds, stride = (o + "u4", o + "u4", "u1", o + "u2", o + "u2"), 16
+        else:
+            names, offsets = ("x", "y", "s", "n", "p"), (0, 2, 4, 8, 12)
+            kinds, stride = (o + "u2", o + "u2", o + "u4", o + "u4", "u1"), 13
+        # The last event may end before its stride does.
+        packed = bytes(message.raw[message.at :]).ljust(count * stride + 4, b"\0")
+        if len(message.raw) < message.at + (count and (count - 1) * stride + 13):
+            raise ValueError("a message ends too early")
+        fields = {
+            name: np.ndarray(count, kind, packed, offset, (stride,))
+            for name, kind, offset in zip(names, kinds, offsets, strict=True)
+        }
+        if message.ros2 and count:
+            first = np.frombuffer(packed, o + "u2", 2)
+            fields["x"] = np.append(first[0], fields["next_x"][:-1])
+            fields["y"] = np.append(first[1], fields["next_y"][:-1])
+        if count:
+            t = _microseconds(fields["s"].astype(np.int64), fields["n"].astype(np.int64))
+            yield t, fields["x"], fields["y"], fields["p"]
+
+
+class _Packet(NamedTuple):
+    stamp: int  # microseconds
+    time_base: int  # nanoseconds
+    encoding: str
+    words: str  # order of their bytes, as numpy writes it
+    payload: bytes
+
+
+def _packet(message: _Message) -> _Packet:
+    stamp = message.header()
+    _, _, _, time_base = (message.number(size) for size in (4, 4, 8, 8))
+    encoding, is_big = message.text(), message.number(1)
+    return _Packet(stamp, time_base, encoding, ">" if is_big else "<", message.bytes())
+
+
+def _packet_columns(path: Path, messages: Iterator[_Message]) -> Iterator[tuple[np.ndarray, ...]]:
+    packets = map(_packet, messages)
+    first = next(packets, None)
+    if first is None:
+        return
+    if first.encoding not in DECODERS:
+        raise RecordingError(
+            f"{path}: its events are encoded as {first.encoding}, expected "
+            f"{' or '.join(DECODERS)}: convert the bag to one of them"
+        )
+    shift = None
+    for stamp, (t, x, y, p) in DECODERS[first.encoding](chain([first], packets)):
+        if len(t):
+            if shift is None:
+                shift = stamp - int(t[0])
+            yield t + shift, x, y, p
+
+
+def _mono(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, ...]]]:
+    for packet in packets:
+        words = np.frombuffer(packet.payload, packet.words + "u8")
+        t = (packet.time_base + (words & 0xFFFFFFFF).astype(np.int64) + 500) // 1000
+        yield packet.stamp, (t, words >> 32 & 0xFFFF, words >> 48 & 0x7FFF, words >> 63)
+
+
+def _evt3(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, ...]]]:
+    """Alone until the first event is known, whose stamp counts; then many messages at once."""
+    state, waiting, started, order = evt3.State(), bytearray(), False, "<"
+    for packet in packets:
+        waiting += packet.payload
+        order = packet.words
+        if started and len(waiting) < 2 * WORDS:
+            continue
+        state, columns = evt3.decode(state, np.frombuffer(bytes(waiting), order + "u2"))
+        waiting, started = bytearray(), started or len(columns[0]) > 0
+        yield packet.stamp, columns
+    yield 0, evt3.decode(state, np.frombuffer(bytes(waiting), order + "u2"))[1]
+
+
+DECODERS = {"evt3": _evt3, "mono": _mono}
+
+
+def _frames(path: Path, bag, topic: str | None) -> Frames | None:
+    if topic is None:
+        return None
+    stamps, recorded = [], []
+    for time, raw in _raw(bag, topic):
+        message = _Message(path, raw)
+        stamps.append(message.header())
+        if not recorded and (encoding := _encoding(message)) not in CHANNELS:
+            logger.warning("%s: images of %s are %s: no frames", path, topic, encoding)
+            return None
+        recorded.append(time)
+
+    def read(i: int) -> np.ndarray:
+        with reading(path, Exception), _bag(path) as bag:
+            for _, raw in _raw(bag, topic, recorded[i]):
+                message = _Message(path, raw)
+                if message.header() == stamps[i]:
+                    return _picture(path, message)
+        raise RecordingError(f"{path}: frame {i + 1} of {topic} is not there any more")
+
+    return Frames(np.array(stamps, np.int64), read) if stamps else None
+
+
+def _encoding(message: _Message) -> str:
+    message.number(4), message.number(4)  # height, width
+    return message.text()
+
+
+def _picture(path: Path, message: _Message) -> np.ndarray:
+    height, width = message.number(4), message.number(4)
+    encoding, is_big, step = message.text(), message.number(1), message.number(4)
+    if encoding not in CHANNELS:
+        raise RecordingError(
+            f"{path}: a frame is {encoding}, expected one of {', '.join(CHANNELS)}"
+        )
+    kind = np.dtype((">" if is_big else "<") + ("u2" if "16" in encoding else "u1"))
+    rows = np.frombuffer(message.bytes(), np.uint8).reshape(height, step)
+    rows = rows[:, : width * CHANNELS[encoding] * kind.itemsize].copy().view(kind)
+    picture = rows.reshape(height, width, CHANNELS[encoding]).astype(kind.newbyteorder("="))
+    return to_frame(picture[..., ::-1] if encoding == "bgr8" else picture, path)

@@ -1,0 +1,292 @@
+"""Text -> Source: one event a line, `t x y p`, in .txt, .csv, .txt.gz, or a .zip with one of them.
+
+    240 180                  the sensor's width and height: E2VID and FireNet; none in ECD
+    0.003811000 96 133 0     seconds, column, row, polarity 0 or 1 (or -1 or 1)
+
+Separators are spaces, tabs or commas. Times are seconds; where none of the first rows has a decimal
+point they are microseconds, and a notice says so. A line of names (`x,y,p,t`, any order, further
+columns are skipped) sets the order of the columns; Metavision's `%geometry:1280,720` sets the size
+and that program's own order. Lines are counted from 1, header included; empty lines do not matter.
+
+Blocks of 16 MB go through pyarrow's parser, at 10 to 15 million events/s on two cores; only a block
+that it refuses is read again in Python, to name the line.
+"""
+
+import gzip
+import re
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import pyarrow as pa
+import pyarrow.csv
+
+from firenet_jax.events import Events, RecordingError, logger
+from firenet_jax.readers import REACH, Source, reading, to_events
+
+BLOCK = 1 << 24  # bytes parsed at once: about 700,000 events
+HEAD = 1 << 16  # bytes from which the layout is told
+SNIFFED = 1000  # rows from which the units are told
+
+NAMES = {
+    "t": ("t", "ts", "time", "timestamp", "timestamps", "t_us", "timestamp_us"),
+    "x": ("x", "xs"),
+    "y": ("y", "ys"),
+    "p": ("p", "ps", "pol", "polarity", "on"),
+}
+WORDS = "no one two three four five six seven eight nine ten".split()
+EXPECTED = {
+    "t": ("the time", "a number of seconds"),
+    "x": ("x", f"a whole number below {REACH}"),
+    "y": ("y", f"a whole number below {REACH}"),
+    "p": ("the polarity", "0 or 1"),
+}
+
+
+class Layout(NamedTuple):
+    """What the first lines say."""
+
+    skip: int  # lines before the first row
+    size: tuple[int, int] | None  # (height, width)
+    names: tuple[str, ...]  # of the columns, in their order: t, x, y, p, and _i for others
+    separator: str
+    types: dict[str, pa.DataType]
+
+
+def matches(path: Path) -> bool:
+    name = path.name.lower()
+    return path.is_file() and name.endswith((".txt", ".csv", ".zip", ".txt.gz", ".csv.gz"))
+
+
+def read(path: Path, member: str | None = None) -> Source:
+    """member: the file to read in a zip that holds several."""
+    if path.suffix.lower() == ".zip" and member is None:
+        member = _only_text(path)
+    layout = _sniff(path, member)
+    return Source(
+        format="text" if member is None else "zipped text",
+        events=lambda: _events(path, member, layout),
+        size=layout.size,
+        place=lambda row: _place(path, member, layout, row),
+    )
+
+
+@contextmanager
+def opened(path: Path, member: str | None = None) -> Iterator[BinaryIO]:
+    """A file, or a file in a zip -> stream of its bytes; damage raises RecordingError."""
+    broken = (zipfile.BadZipFile, zlib.error, EOFError, gzip.BadGzipFile)
+    # RuntimeError: an encrypted member, or (NotImplementedError) an unknown compression.
+    with reading(path, *broken, RuntimeError), ExitStack() as stack:
+        if member is not None:
+            archive = stack.enter_context(zipfile.ZipFile(path))
+            yield stack.enter_context(archive.open(member))
+        elif path.suffix.lower() == ".gz":
+            yield stack.enter_context(gzip.open(path))
+        else:
+            yield stack.enter_context(open(path, "rb"))
+
+
+def members(path: Path) -> list[str]:
+    """The names of the files in a zip."""
+    with reading(path, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+        names = [info.filename for info in archive.infolist() if not info.is_dir()]
+    return [name for name in names if not name.startswith("__MACOSX/")]
+
+
+def _only_text(path: Path) -> str:
+    names = members(path)
+    texts = [name for name in names if name.lower().endswith((".txt", ".csv"))]
+    texts = texts or names[:1] * (len(names) == 1)  # a single file may have any name
+    if len(texts) != 1:
+        found = ", ".join(texts[:4]) + (", ..." if len(texts) > 4 else "")
+        raise RecordingError(
+            f"{path}: holds {len(texts)} text files{f' ({found})' if texts else ''} where one is "
+            "expected: unpack it and name the recording"
+        )
+    return texts[0]
+
+
+def _sniff(path: Path, member: str | None) -> Layout:
+    with opened(path, member) as stream:
+        head = stream.read(HEAD)
+    lines = head.decode("utf-8-sig", "replace").split("\n")
+    if len(head) == HEAD:
+        lines.pop()  # cut off
+    size, names, skip = None, ("t", "x", "y", "p"), len(lines)
+    for number, line in enumerate(map(str.strip, lines), 1):
+        words = _words(line, "," if "," in line else " ")
+        if match := re.fullmatch(r"%geometry:(\d+),(\d+)", line):
+            size, names = (int(match[2]), int(match[1])), ("x", "y", "p", "t")
+        elif named := _names(line.lower().lstrip("#% ")):
+            names = named
+        elif not line or line.startswith(("#", "%")):
+            continue
+        elif size is None and len(words) == 2 and all(map(str.isdecimal, words)):
+            size = (int(words[1]), int(words[0]))
+        elif not _is_number(words[0]):
+            raise RecordingError(
+                f"{path}, line {number}: {_shown(line)} where numbers, or the names of columns "
+                "t, x, y and p, are expected: it is not a text of events"
+            )
+        else:
+            skip = number - 1
+            break
+    rows = [line for line in lines[skip:] if line.strip()][:SNIFFED]
+    separator = "," if rows and "," in rows[0] else "\t" if rows and "\t" in rows[0] else " "
+    rows = [_words(row, separator) for row in rows]
+
+    def whole(name: str) -> bool:
+        index = names.index(name)
+        return not any(set(".e") & set(row[index].lower()) for row in rows if index < len(row))
+
+    types = {name: pa.int32() if whole(name) else pa.float64() for name in ("x", "y", "p")}
+    types["t"] = pa.int64() if rows and whole("t") else pa.float64()
+    if types["t"] == pa.int64():
+        logger.warning("%s: times without a decimal point: read as microseconds", path)
+    return Layout(skip, size, names, separator, types)
+
+
+def _names(line: str) -> tuple[str, ...] | None:
+    """A line of names -> the columns' own names here; None if t, x, y, p are not all among them."""
+    known = {name: key for key, names in NAMES.items() for name in names}
+    line = re.sub(r"\s*[\[(].*?[\])]|\"", "", line)  # units, as in `time [us]`, and quotes
+    words = _words(line, "," if "," in line else " ")
+    named = tuple(known.get(word, f"_{i}") for i, word in enumerate(words))
+    return named if all(named.count(key) == 1 for key in NAMES) else None
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _words(line: str, separator: str) -> list[str]:
+    return [word.strip() for word in line.split(",")] if separator == "," else line.split()
+
+
+def _blocks(path: Path, member: str | None, skip: int) -> Iterator[tuple[int, bytes]]:
+    """(number of its first line, whole lines), without the header."""
+    number, rest = 1, b""
+    with opened(path, member) as stream:
+        while data := stream.read(BLOCK):
+            end = data.rfind(b"\n") + 1
+            if not end and len(rest) > HEAD:
+                raise RecordingError(
+                    f"{path}, line {number}: does not end: it is not a text of events"
+                )
+            block, rest = rest + data[:end], data[end:] if end else rest + data
+            if not end:
+                continue
+            if number == 1:
+                block = block.removeprefix(b"\xef\xbb\xbf")  # the byte order mark of Windows
+                block, number = block.split(b"\n", skip)[-1], 1 + skip
+            yield number, block
+            number += block.count(b"\n")
+    if rest and (number > 1 or not skip):  # the last line may lack its end
+        yield number, rest.removeprefix(b"\xef\xbb\xbf")
+
+
+def _events(path: Path, member: str | None, layout: Layout) -> Iterator[Events]:
+    for number, block in _blocks(path, member, layout.skip):
+        if not block or block.isspace():
+            continue
+        table = _parse(path, number, block, layout)
+        columns = (table[name].to_numpy() for name in "txyp")
+        yield to_events(path, 0, *columns, partial(_line, number, block))
+
+
+def _parse(path: Path, number: int, block: bytes, layout: Layout) -> pa.Table:
+    with suppress(pa.ArrowInvalid):
+        return _table(block, layout)
+    try:  # once more with single spaces between words: rare, and it costs a third of the time
+        return _table(_tidied(block, layout.separator), layout)
+    except pa.ArrowInvalid as error:
+        _refuse(path, number, block, layout)
+        raise RecordingError(
+            f"{path}, in the lines from {number}: not rows of t x y p ({error})"
+        ) from error
+
+
+def _table(block: bytes, layout: Layout) -> pa.Table:
+    return pyarrow.csv.read_csv(
+        pa.BufferReader(block),
+        pyarrow.csv.ReadOptions(column_names=layout.names),
+        pyarrow.csv.ParseOptions(delimiter=layout.separator, quote_char=False),
+        pyarrow.csv.ConvertOptions(
+            column_types=layout.types, include_columns=list("txyp"), null_values=[]
+        ),
+    )
+
+
+def _tidied(block: bytes, separator: str) -> bytes:
+    """Any run of spaces and tabs -> one separator between words, none at the ends of a line."""
+    block = block.replace(b"\r\n", b"\n").replace(b"\t", b" ")
+    while b"  " in block:
+        block = block.replace(b"  ", b" ")
+    block = block.replace(b"\n ", b"\n").replace(b" \n", b"\n").strip(b" ")
+    return block if separator == "," else block.replace(b" ", separator.encode())
+
+
+def _refuse(path: Path, start: int, block: bytes, layout: Layout):
+    """Raises RecordingError for the first line of the block that is no event, in Python's time."""
+    columns = len(layout.names)
+    for number, line in enumerate(block.decode("utf-8", "replace").split("\n"), start):
+        words = _words(line.strip(), layout.separator)
+        if not line.strip():
+            continue
+        if len(words) != columns:
+            raise RecordingError(
+                f"{path}, line {number}: {_count(len(words))} instead of "
+                f"{_count(columns, '')}: {_shown(line)}"
+            )
+        for name, word in zip(layout.names, words, strict=True):
+            if name in EXPECTED and not _fits(word, layout.types[name]):
+                what, expected = EXPECTED[name]
+                if name == "t" and layout.types["t"] == pa.int64():
+                    expected = "whole microseconds, as in the first lines"
+                raise RecordingError(
+                    f"{path}, line {number}: {what} is {word}, expected {expected}"
+                )
+
+
+def _fits(word: str, kind: pa.DataType) -> bool:
+    if kind == pa.float64():
+        return _is_number(word)
+    limit = 2 ** (kind.bit_width - 1)
+    return re.fullmatch(r"-?\d+", word) is not None and -limit <= int(word) < limit
+
+
+def _count(number: int, noun: str = " words") -> str:
+    number_in_words = WORDS[number] if number < len(WORDS) else str(number)
+    return number_in_words + (noun.rstrip("s") if number == 1 else noun)
+
+
+def _shown(line: str) -> str:
+    line = line.strip()
+    return repr(line if len(line) <= 60 else line[:57] + "...")
+
+
+def _filled(block: bytes) -> list[int]:
+    """The lines of a block that are not empty: pyarrow's rows."""
+    return [i for i, line in enumerate(block.split(b"\n")) if line.strip()]
+
+
+def _line(number: int, block: bytes, row: int) -> str:
+    return f"line {number + _filled(block)[row]}"
+
+
+def _place(path: Path, member: str | None, layout: Layout, row: int) -> str:
+    """Reads the file again up to that row: for error messages only, which end the reading."""
+    for number, block in _blocks(path, member, layout.skip):
+        rows = len(_filled(block))
+        if row < rows:
+            return _line(number, block, row)
+        row -= rows
+    return "its last line"

@@ -1,0 +1,143 @@
+"""Event tensors -> images: FireNet's step under `jax.lax.scan`, and the whole program to pictures.
+
+Event tensors are (T, B, H, W, 5), images (T, B, H, W). State goes in and comes out, so a recording
+may be streamed in chunks of any T, and B recordings of different lengths may run side by side:
+`valid` (T, B) says which windows exist, and the others leave the state as it was.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from firenet_jax.network import BINS, State, Weights, initial_state, step
+from firenet_jax.pictures import (
+    Display,
+    DisplayState,
+    display,
+    event_pictures,
+    initial_display_state,
+)
+from firenet_jax.tensors import Packed, normalise, voxelise
+
+
+@dataclass(frozen=True)
+class Network:
+    """How the network runs."""
+
+    recurrent: bool = True
+    """--no-recurrent forgets everything between windows (ablation, Fig. 5 of the paper)."""
+    bfloat16: bool = False
+    """Convolutions in bfloat16: faster on accelerators, slower on CPUs, a little less accurate."""
+    pad: int = 1
+    """Pad tensors by reflection to a multiple of this; 16 is what the original program does."""
+
+
+@partial(jax.jit, static_argnames=("recurrent", "dtype"))
+def reconstruct(
+    weights: Weights,
+    state: State,
+    tensors: jax.Array,
+    valid: jax.Array | None = None,
+    *,
+    recurrent: bool = True,
+    dtype=jnp.float32,
+) -> tuple[State, jax.Array]:
+    """(State, (T, B, H, W, 5)) -> (State, images (T, B, H, W) float32).
+
+    tensors: as `event_tensors` gives them; normalised here if the weights ask for it.
+    valid: (T, B) bool; where False the state stays as it was and the image means nothing.
+    recurrent: False starts every window from a zero state (the state returned is zero).
+    Raises ValueError where the shapes of state and tensors do not belong together.
+    """
+    _check_shapes(state, tensors)
+    if weights.normalise:
+        tensors = normalise(tensors)
+
+    def body(state, inputs):
+        tensor, exists = inputs
+        new, image = step(weights.params, state, tensor, dtype=dtype)
+        if not recurrent:
+            return state, image
+        if exists is not None:
+            keep = exists[:, None, None, None]
+            new = jax.tree.map(lambda new, old: jnp.where(keep, new, old), new, state)
+        return new, image
+
+    if not recurrent:
+        state = jax.tree.map(jnp.zeros_like, state)
+    return jax.lax.scan(body, state, (tensors, valid))
+
+
+def _check_shapes(state: State, tensors: jax.Array) -> None:
+    if tensors.ndim != 5 or tensors.shape[-1] != BINS:
+        raise ValueError(f"event tensors are (T, B, H, W, {BINS}), not {tensors.shape}")
+    if state.g1.shape[:3] != tensors.shape[1:4]:
+        raise ValueError(
+            f"the state is for (B, H, W) = {state.g1.shape[:3]}, the event tensors are "
+            f"{tensors.shape[1:4]}: make it with initial_state(batch, height, width)"
+        )
+
+
+class Session(NamedTuple):
+    """All that must be kept between two chunks of B recordings."""
+
+    network: State
+    display: DisplayState
+
+
+def initial_session(batch: int, height: int, width: int, network: Network) -> Session:
+    (top, bottom), (left, right) = padding(height, width, network.pad)
+    state = initial_state(batch, top + height + bottom, left + width + right)
+    return Session(state, initial_display_state(batch))
+
+
+def padding(height: int, width: int, multiple: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """((top, bottom), (left, right)) up to the next multiple; the larger half first (rpg_e2vid)."""
+    missing = (-height % multiple, -width % multiple)
+    return tuple((-(-n // 2), n // 2) for n in missing)
+
+
+@partial(
+    jax.jit,
+    static_argnames=("height", "width", "network", "settings", "preview"),
+)
+def events_to_pictures(
+    weights: Weights,
+    session: Session,
+    events: Packed,
+    valid: jax.Array,
+    *,
+    height: int,
+    width: int,
+    network: Network = Network(),
+    settings: Display = Display(),
+    preview: bool = False,
+) -> tuple[Session, jax.Array]:
+    """(Session, the events of T x B windows) -> (Session, pictures), as one compiled program.
+
+    Voxels, normalisation, padding, network, unsharp mask, intensity range, 8 bits. Pictures are
+    (T, B, H, W) uint8; with preview (T, B, H, 2 W, 3): the events beside the reconstruction.
+    valid: (T, B) bool, as in `reconstruct`.
+    """
+    tensors = voxelise(events, height=height, width=width)
+    (top, bottom), (left, right) = sides = padding(height, width, network.pad)
+    inputs = normalise(tensors) if weights.normalise else tensors
+    inputs = jnp.pad(inputs, ((0, 0), (0, 0), *sides, (0, 0)), mode="reflect")
+    state, images = reconstruct(
+        Weights(weights.params, normalise=False),
+        session.network,
+        inputs,
+        valid,
+        recurrent=network.recurrent,
+        dtype=jnp.bfloat16 if network.bfloat16 else jnp.float32,
+    )
+    # The original program crops last: its mask and its range see the padded image.
+    shown, greys = display(session.display, images, valid, settings)
+    greys = greys[:, :, top : top + height, left : left + width]
+    if preview:
+        colours = jnp.broadcast_to(greys[..., None], (*greys.shape, 3))
+        greys = jnp.concatenate([event_pictures(tensors), colours], axis=-2)
+    return Session(state, shown), greys

@@ -1,0 +1,179 @@
+"""Event stream -> windows: where to cut a recording, kept apart from reading and from voxels.
+
+Windows are consecutive and, unless `step` says otherwise, do not overlap. The last one may be
+partial: no event is lost. Memory holds one window and one chunk, whatever the recording's length.
+"""
+
+import itertools
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import tyro
+
+from firenet_jax.events import Events, Recording, RecordingError, concatenate, logger
+
+
+class Window(NamedTuple):
+    """The events that become one event tensor, and so one image."""
+
+    events: Events
+    time: int  # int64 us: of the last event; of the window's end where it has none
+
+
+@dataclass(frozen=True)
+class Windows:
+    """How to cut the events into windows, one image each. Choose at most one way."""
+
+    events: Annotated[int | None, tyro.conf.arg(aliases=["-N"])] = None
+    """A window holds this many events."""
+    events_per_pixel: float | None = None
+    """A window holds this many events per pixel of the sensor (0.35 if nothing is chosen)."""
+    duration: Annotated[float | None, tyro.conf.arg(aliases=["-T"])] = None
+    """A window lasts this many milliseconds, on a grid that starts at the first event."""
+    between_frames: bool = False
+    """A window lasts from one of the camera's frames to the next."""
+    step: float | None = None
+    """Windows start this far apart, in events (or ms, with --duration): less than the window
+    makes them overlap."""
+
+    def __post_init__(self):
+        ways = [self.events, self.events_per_pixel, self.duration, self.between_frames or None]
+        if sum(way is not None for way in ways) > 1:
+            raise ValueError(
+                "windows are cut in one way: choose one of --events, --events-per-pixel, "
+                "--duration and --between-frames"
+            )
+        for name in ("events", "events_per_pixel", "duration", "step"):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value}, but must be more than 0")
+        if self.step is not None:
+            if self.between_frames:
+                raise ValueError("step overlaps windows of a fixed size, not those between frames")
+            if self.duration is None and self.step != int(self.step):
+                raise ValueError(f"step is {self.step}, but counts events: pass a whole number")
+            if self.duration is not None and round(self.step * 1000) < 1:
+                raise ValueError(f"step is {self.step} ms, but times are whole microseconds")
+        if self.duration is not None and round(self.duration * 1000) < 1:
+            raise ValueError(f"duration is {self.duration} ms, but times are whole microseconds")
+
+    def count(self, pixels: int) -> int | None:
+        """Events in a full window of a sensor with this many pixels; None where time decides."""
+        if self.duration is not None or self.between_frames:
+            return None
+        if self.events is not None:
+            return self.events
+        return max(1, round((self.events_per_pixel or 0.35) * pixels))
+
+
+def cut(recording: Recording, windows: Windows, chunks: Iterable[Events] | None = None):
+    """Recording -> iterator of `Window`, as `windows` says.
+
+    chunks: the recording's events after filters; None: as they are.
+    Raises RecordingError where windows between frames are asked of a recording without frames,
+    ValueError where the step is longer than the window.
+    """
+    chunks = iter(recording.events() if chunks is None else chunks)
+    if windows.between_frames:
+        if recording.frames is None or len(recording.frames.times) < 2:
+            raise RecordingError(
+                f"{recording.path}: windows between frames need a recording with two frames or "
+                "more: use --events-per-pixel or --duration"
+            )
+        return _by_time(chunks, lambda first: _frame_spans(recording.frames.times, first))
+    if windows.duration is not None:
+        step = windows.duration if windows.step is None else windows.step
+        if step > windows.duration:
+            raise ValueError(f"step of {step} ms is longer than the window, {windows.duration} ms")
+        return _by_time(chunks, lambda first: _grid_spans(windows.duration, step, first))
+    count = windows.count(recording.pixels)
+    step = count if windows.step is None else int(windows.step)
+    if step > count:
+        raise ValueError(f"step of {step} events is longer than the window, {count} events")
+    warn_if_unusual(count, recording.pixels)
+    return _by_count(chunks, count, step)
+
+
+def warn_if_unusual(events: float, pixels: int) -> None:
+    """Says when windows hold fewer or more events than the network's training made usual."""
+    density = events / pixels
+    if not 0.1 <= density <= 1.5:
+        logger.warning(
+            "%d events per window are %.3g per pixel: fewer than 0.1 give noisy and faint images, "
+            "more than 1.5 smeared ones; 0.35 (%d events) is usual for this sensor",
+            events, density, round(0.35 * pixels),
+        )  # fmt: skip
+
+
+def _by_count(chunks: Iterator[Events], count: int, step: int) -> Iterator[Window]:
+    """Windows [k step, k step + count) over the numbered events; the last may be shorter."""
+    held, size, covered = [], 0, 0  # events not yet dropped; of them, how many were in a window
+    for chunk in chunks:
+        held.append(chunk)
+        size += len(chunk)
+        if size < count:
+            continue
+        events, start = concatenate(held), 0
+        while size - start >= count:
+            yield _window(events, start, start + count)
+            covered = start + count
+            start += step
+        held, size, covered = [events.select(slice(start, None))], size - start, covered - start
+    if size > max(covered, 0):
+        yield _window(concatenate(held), 0, size)
+
+
+def _by_time(chunks: Iterator[Events], spans) -> Iterator[Window]:
+    """Windows of the events with start <= t < stop, for each span of `spans(first time)`.
+
+    Ends with the first window that reaches the recording's last event.
+    """
+    first = next(chunks, None)
+    if first is None:
+        return
+    held, ended = first, False
+    for start, stop in spans(int(first.t[0])):
+        more, last = [], held.t[-1] if len(held) else None
+        while not ended and (last is None or last < stop):
+            chunk = next(chunks, None)
+            if chunk is None:
+                ended = True
+            else:
+                more.append(chunk)
+                last = chunk.t[-1]
+        held = concatenate([held, *more])
+        a, b = np.searchsorted(held.t, [start, stop])
+        yield _window(held, a, b, stop)
+        if ended and b == len(held):
+            return
+        held = held.select(slice(a, None))
+
+
+def _window(events: Events, start: int, stop: int, end: int = 0) -> Window:
+    events = events.select(slice(start, stop))
+    return Window(events, int(events.t[-1]) if len(events) else int(end))
+
+
+def _grid_spans(duration: float, step: float, first: int) -> Iterator[tuple[int, int]]:
+    """Milliseconds -> microsecond spans; each is computed from k, so rounding never adds up."""
+    for k in itertools.count():
+        start = first + round(k * step * 1000)
+        # Without overlap the end is the next start, to the microsecond.
+        yield start, first + round((k * step + duration) * 1000)
+
+
+def _frame_spans(times: np.ndarray, first: int) -> Iterator[tuple[int, int]]:
+    """Frame times -> spans, the clock of the frames going on before the first and after the last.
+
+    So a recording whose frames begin late or end early has no window of all the rest.
+    """
+    times = np.unique(times)
+    interval = max(1, int(np.median(np.diff(times))))
+    missing = max(0, (int(times[0]) - first) // interval)
+    before = times[0] - interval * np.arange(missing, 0, -1)
+    after = (int(times[-1]) + interval * k for k in itertools.count(1))
+    edges = itertools.chain(before.tolist(), times.tolist(), after)
+    edges = itertools.chain([first], (edge for edge in edges if edge > first))
+    yield from itertools.pairwise(edges)

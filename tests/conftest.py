@@ -1,0 +1,39 @@
+"""What all tests share: strict JAX flags, the slow switch, data outside the repository."""
+
+import os
+from pathlib import Path
+
+import jax
+import pytest
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def pytest_addoption(parser):
+    parser.addoption("--slow", action="store_true", help="run the slow tests too")
+
+
+def pytest_collection_modifyitems(config, items):
+    for item in items:
+        if "slow" in item.keywords and not config.getoption("--slow"):
+            item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
+        if "gpu" in item.keywords and jax.default_backend() != "gpu":
+            item.add_marker(pytest.mark.skip(reason="needs a GPU"))
+
+
+def _folder(variable: str) -> Path:
+    if not os.environ.get(variable):
+        pytest.skip(f"needs data outside the repository: set {variable} to its folder")
+    return Path(os.environ[variable])
+
+
+@pytest.fixture
+def reference() -> Path:
+    """Folder with the published weights and their inputs and outputs."""
+    return _folder("FIRENET_REFERENCE")
+
+
+@pytest.fixture
+def recordings() -> Path:
+    """Folder with real recordings, one for each format."""
+    return _folder("FIRENET_RECORDINGS")

@@ -1,0 +1,178 @@
+"""What a user meets: exit codes, and one sentence for everything that is wrong."""
+
+import json
+import pickle
+import re
+import subprocess
+import sys
+
+import h5py
+import jax
+import numpy as np
+import pytest
+from test_pipeline import write_recording
+
+from firenet_jax import cli
+from firenet_jax.checkpoint import save_weights
+from firenet_jax.network import Weights, initial_params
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A working folder with weights.npz and a recording a.txt."""
+    monkeypatch.chdir(tmp_path)
+    save_weights("weights.npz", Weights(initial_params(jax.random.key(0)), True))
+    write_recording(tmp_path / "a.txt", 500)
+    return tmp_path
+
+
+def firenet(capsys, line):
+    """Runs one command line; returns (exit code, stdout, stderr)."""
+    code = cli.main(line.split())
+    return code, *capsys.readouterr()
+
+
+RUN = "reconstruct a.txt -o out --weights weights.npz"
+
+
+def test_help_and_version(capsys):
+    assert firenet(capsys, "--help")[0] == 0
+    assert firenet(capsys, "--version")[1].strip()
+    code, _, error = firenet(capsys, "nonsense")
+    assert code == 2 and "no command 'nonsense'" in error
+    for command in cli.COMMANDS:
+        with pytest.raises(SystemExit) as stop:
+            cli.main([command, "--help"])
+        assert stop.value.code == 0
+        assert f"firenet {command} " in capsys.readouterr().out  # an example
+
+
+@pytest.mark.parametrize("output", ["out", "out.mp4", "out.gif"])
+def test_reconstruct_writes_each_kind_of_output(here, capsys, output):
+    line = f"reconstruct a.txt -o {output} -c weights.npz -N 100 --preview"
+    assert firenet(capsys, line)[0] == 0
+    assert (here / output).exists() and not list(here.glob("*partial*"))
+
+
+def test_every_option_is_accepted(here, capsys):
+    (here / "hot.txt").write_text("1,1\n")
+    line = f"{RUN} -T 50 --step 25 --no-recurrent --bfloat16 --pad 16 --auto-range --unsharp 0 "
+    line += "--hot-pixels hot.txt --flip --start 0.1 --stop 0.9 --fps 10 --sensor-size 30x40 "
+    line += "--chunk 3 --batch 2 --overwrite"
+    code, _, error = firenet(capsys, line)
+    assert code == 0, error
+    assert len(list((here / "out").glob("*.png"))) == 31  # starts 0, 25, ... 750 ms
+
+
+def test_info_as_lines_and_as_json(here, capsys):
+    code, out, _ = firenet(capsys, "info a.txt")
+    assert code == 0 and "24x20 pixels" in out and "500" in out
+    facts = json.loads(firenet(capsys, "info a.txt --json")[1])
+    rows = np.loadtxt(here / "a.txt", skiprows=1)
+    assert facts["events"] == 500 and (facts["width"], facts["height"]) == (24, 20)
+    assert facts["duration_s"] == pytest.approx(np.ptp(rows[:, 0]))
+    assert facts["on_share"] == pytest.approx(rows[:, 3].mean())
+    assert facts["events_per_window"] == 168 and facts["windows"] == 3
+
+
+def test_convert_needs_no_pytorch_and_says_what_it_did(here, capsys, reference):
+    line = f"convert {reference}/firenet_published.pth -o new.npz"
+    assert firenet(capsys, line)[0] == 0
+    assert firenet(capsys, "reconstruct a.txt -o out -c new.npz")[0] == 0
+
+
+def text_with(path, lines):
+    path.write_text("24 20\n" + "\n".join(lines) + "\n")
+
+
+def truncated(path, data):
+    path.write_bytes(data[: len(data) // 2])
+
+
+def make_bad_inputs(folder):
+    """name -> what the message must contain."""
+    good = ["0.1 3 4 1", "0.2 3 4 0"]
+    (folder / "empty.txt").write_text("")
+    text_with(folder / "five.txt", [*good, "0.3 1 2 1 7"])
+    text_with(folder / "nan.txt", [*good, "nan 1 2 1"])
+    text_with(folder / "backwards.txt", [*good, "0.15 1 2 1"])
+    text_with(folder / "negative.txt", [*good, "0.3 -1 2 1"])
+    text_with(folder / "large.txt", [*good, "0.3 24 2 1"])
+    (folder / "unknown.xyz").write_text("0.1 3 4 1")
+    (folder / "cut.zip").write_bytes(b"PK\x03\x04" + b"junk" * 100)
+    with h5py.File(folder / "whole.h5", "w") as file:
+        for name, dtype in [("xs", "i2"), ("ys", "i2"), ("ts", "f8"), ("ps", "?")]:
+            file[f"events/{name}"] = np.arange(5000).astype(dtype) % 20
+        file.attrs["sensor_resolution"] = [20, 24]
+    truncated(folder / "cut.h5", (folder / "whole.h5").read_bytes())
+    (folder / "cut.bin").write_bytes(b"1234567")
+    return {
+        "missing.txt": "no such file", "empty.txt": "empty", "five.txt": "line 4",
+        "nan.txt": "line 4", "backwards.txt": "line 4", "negative.txt": "line 4",
+        "large.txt": "line 4", "unknown.xyz": "known format", "cut.zip": "cut.zip",
+        "cut.h5": "cut.h5", "cut.bin": "cut.bin", "whole.h5": "event 21",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("command", ["info", "reconstruct"])
+def test_bad_recordings_give_one_sentence_and_no_output(here, capsys, command):
+    for name, place in make_bad_inputs(here).items():
+        line = f"reconstruct {name} -o out -c weights.npz" if command != "info" else f"info {name}"
+        code, _, error = firenet(capsys, line)
+        assert code == 1, name
+        said = error.strip().splitlines()
+        assert len(said) == 1 and said[0].startswith("firenet: error: "), (name, error)
+        assert name in said[0] and place in said[0], (name, error)
+        assert not (here / "out").exists()
+
+
+def test_a_sensor_size_that_is_too_small(here, capsys):
+    code, _, error = firenet(capsys, f"{RUN} --sensor-size 20x20")
+    assert code == 1 and re.search(r"a.txt, line \d+: x is 2\d, outside the sensor of 20x20", error)
+    assert not (here / "out").exists()
+
+
+def test_bad_weights_give_one_sentence_and_run_nothing(here, capsys):
+    class Malicious:
+        def __reduce__(self):
+            return open, (str(here / "executed"), "w")
+
+    (here / "evil.pth").write_bytes(pickle.dumps({"state_dict": Malicious()}))
+    (here / "empty.pth").write_bytes(b"")
+    np.savez(here / "other.npz", kernel=np.zeros(3))
+    whole = (here / "weights.npz").read_bytes()
+    truncated(here / "cut.npz", whole)
+    for name in ("evil.pth", "empty.pth", "other.npz", "cut.npz", "missing.npz", "a.txt"):
+        code, _, error = firenet(capsys, f"reconstruct a.txt -o out -c {name}")
+        assert code == 1 and name in error and len(error.strip().splitlines()) == 1, error
+    assert not (here / "executed").exists() and not (here / "out").exists()
+
+
+def test_missing_weights_say_what_to_pass(here, capsys):
+    code, _, error = firenet(capsys, "reconstruct a.txt -o out")
+    assert code == 1 and "--weights" in error and len(error.strip().splitlines()) == 1
+
+
+def test_outputs_that_cannot_be_written(here, capsys):
+    (here / "file").write_text("mine")
+    for output, said in [("file/out", "cannot make"), ("file", "is a file"), ("a.avi", ".avi")]:
+        code, _, error = firenet(capsys, f"reconstruct a.txt -o {output} -c weights.npz")
+        assert code == 1 and said in error and len(error.strip().splitlines()) == 1, error
+    assert (here / "file").read_text() == "mine"
+
+
+@pytest.mark.parametrize("output", ["out", "out.mp4", "out.gif"])
+def test_no_room_while_writing(here, output):
+    """A limit on the size of files stands for a full disk; in a process of its own."""
+    write_recording(here / "wide.txt", 40_000, width=200, height=150)
+
+    script = (
+        "import resource, sys; from firenet_jax import cli, pipeline; "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000)); "
+        f"sys.exit(cli.main('reconstruct wide.txt -o {output} -c weights.npz --preview'.split()))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 1, done.stderr
+    said = [line for line in done.stderr.splitlines() if "error" in line]
+    assert len(said) == 1 and output in said[0] and "Traceback" not in done.stderr, done.stderr
+    assert not (here / output).exists()

@@ -1,0 +1,74 @@
+import numpy as np
+import pytest
+from test_tensors import random_events
+from test_windows import recording_of
+
+from firenet_jax import filters
+from firenet_jax.events import Events, Recording, RecordingError, concatenate
+
+
+def test_between_counts_seconds_from_the_first_event():
+    t = 5_000_000 + np.arange(0, 1_000_000, 1000)
+    chunks = recording_of(t).events
+    for start, stop in [(None, None), (0.1, None), (None, 0.25), (0.1005, 0.3), (2, 3)]:
+        kept = [events.t for events in filters.between(chunks(), start, stop)]
+        low, high = 5e6 + 1e6 * (start or 0), 5e6 + 1e6 * (stop or 1e9)
+        expected = t[(t >= low) & (t < high)]
+        assert np.concatenate([*kept, []]).tolist() == expected.tolist()
+
+
+def test_between_stops_reading_at_the_end():
+    def chunks():
+        yield Events.of([0, 10], [0, 0], [0, 0], [1, 1])
+        yield Events.of([2_000_000], [0], [0], [1])
+        raise AssertionError("read beyond the end")
+
+    assert [len(events) for events in filters.between(chunks(), None, 1.0)] == [2]
+
+
+def test_without_drops_hot_pixels():
+    hot = np.zeros((2, 3), bool)
+    hot[1, 2] = True
+    events = concatenate(list(filters.without(recording_of(range(60)).events(), hot)))
+    assert len(events) == 50 and not ((events.x == 2) & (events.y == 1)).any()
+
+
+def test_turned_is_a_turn_by_180_degrees():
+    events = next(filters.turned(iter([Events.of([0, 1], [0, 16], [0, 3], [1, 0])]), 12, 17))
+    assert events.x.tolist() == [16, 0] and events.y.tolist() == [11, 8]
+    assert events.x.dtype == np.int16
+
+
+def test_hot_pixels_are_found_and_edges_are_not():
+    """A bar sweeps over half of the sensor; two pixels fire on their own, one beside the bar."""
+    rng = np.random.default_rng(0)
+    events = random_events(rng, 500, 60, 80)
+    sweep_y, sweep_x = np.divmod(np.repeat(np.arange(60 * 40), 20), 40)
+    x = np.concatenate([events.x, sweep_x, [70] * 400, [20] * 900])
+    y = np.concatenate([events.y, sweep_y, [30] * 400, [10] * 900])
+    every = Events.of(np.zeros(len(x)), x, y, np.ones(len(x)))
+    recording = Recording("memory", "memory", 60, 80, lambda: iter([every]))
+    hot = filters.find_hot_pixels(recording)
+    assert np.argwhere(hot).tolist() == [[10, 20], [30, 70]]
+
+
+def test_hot_pixels_of_a_quiet_recording_are_none():
+    recording = Recording("memory", "memory", 6, 8, lambda: iter([]))
+    assert not filters.find_hot_pixels(recording).any()
+
+
+def test_read_hot_pixels(tmp_path):
+    path = tmp_path / "hot.txt"
+    path.write_text("3,1\n\n0, 2\n")
+    hot = filters.read_hot_pixels(path, 4, 5)
+    assert np.argwhere(hot).tolist() == [[1, 3], [2, 0]]
+
+
+@pytest.mark.parametrize("line", ["5,0", "-1,2", "1 2", "1,2,3", "a,b"])
+def test_read_hot_pixels_names_the_bad_line(tmp_path, line):
+    path = tmp_path / "hot.txt"
+    path.write_text(f"1,1\n{line}\n")
+    with pytest.raises(RecordingError, match="hot.txt, line 2"):
+        filters.read_hot_pixels(path, 4, 5)
+    with pytest.raises(RecordingError, match="missing.txt"):
+        filters.read_hot_pixels(tmp_path / "missing.txt", 4, 5)

@@ -1,0 +1,111 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import references
+
+from firenet_jax.checkpoint import convert
+from firenet_jax.network import Weights, initial_params, initial_state, step
+from firenet_jax.reconstruction import reconstruct
+
+
+def test_has_the_papers_number_of_parameters():
+    params = initial_params(jax.random.key(0))
+    assert sum(leaf.size for leaf in jax.tree.leaves(params)) == 37_777
+
+
+def test_initial_gates_are_orthogonal_with_zero_bias():
+    gates = initial_params(jax.random.key(1))["gru1"]["gates"]
+    kernel = np.asarray(gates["kernel"]).reshape(-1, 32)
+    np.testing.assert_allclose(kernel.T @ kernel, np.eye(32), atol=1e-5)
+    assert not np.asarray(gates["bias"]).any()
+
+
+@pytest.mark.reference
+def test_published_weights_give_the_published_images(reference):
+    """The authors' own module code, eight steps from a zero state, without normalisation."""
+    data = np.load(reference / "firenet_published_io.npz")
+    weights = convert(reference / "firenet_published.pth")
+    assert weights.normalise
+    tensors = jnp.asarray(data["event_tensors"]).transpose(0, 2, 3, 1)[:, None]
+    state, images = reconstruct(
+        Weights(weights.params, normalise=False), initial_state(1, 45, 60), tensors
+    )
+    np.testing.assert_allclose(images[:, 0], data["images"][:, 0], atol=1e-5)
+    np.testing.assert_allclose(state.g1[0].transpose(2, 0, 1), data["state1"][0], atol=1e-5)
+    np.testing.assert_allclose(state.g2[0].transpose(2, 0, 1), data["state2"][0], atol=1e-5)
+
+
+def random_run(seed=0, steps=20, batch=3, height=23, width=31):
+    """Parameters with biases, scaled so that images leave [0, 1]; random tensors."""
+    keys = iter(jax.random.split(jax.random.key(seed), 64))
+    params = initial_params(next(keys))
+    params = jax.tree.map(
+        lambda leaf: 1.5 * leaf + 0.05 * jax.random.normal(next(keys), leaf.shape), params
+    )
+    params["prediction"]["kernel"] *= 3
+    params["prediction"]["bias"] += 0.5
+    tensors = jax.random.normal(next(keys), (steps, batch, height, width, 5))
+    return params, tensors
+
+
+def torch_run(params, tensors):
+    torch = pytest.importorskip("torch", reason="compares with PyTorch, which is not installed")
+    params = jax.tree.map(lambda leaf: torch.tensor(np.asarray(leaf), requires_grad=True), params)
+    run = references.torch_firenet(params)
+    steps, batch, height, width, _ = tensors.shape
+    state = (torch.zeros(batch, 16, height, width),) * 2
+    images = []
+    for tensor in torch.tensor(np.asarray(tensors)).permute(0, 1, 4, 2, 3):
+        state, image = run(state, tensor)
+        images.append(image[:, 0])
+    return params, state, torch.stack(images)
+
+
+@pytest.mark.reference
+def test_equals_a_pytorch_twin():
+    params, tensors = random_run()
+    _, (g1, g2), expected = torch_run(params, tensors)
+    state, images = reconstruct(Weights(params, False), initial_state(3, 23, 31), tensors)
+    expected = expected.detach().numpy()
+    assert expected.min() < 0 and expected.max() > 1  # nothing clips
+    np.testing.assert_allclose(images, expected, atol=1e-5)
+    for ours, theirs in zip(state, (g1, g2), strict=True):
+        theirs = theirs.detach().permute(0, 2, 3, 1).numpy()
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
+@pytest.mark.reference
+def test_gradients_equal_a_pytorch_twin():
+    params, tensors = random_run(seed=3, steps=5, batch=2, height=15, width=18)
+    theirs, _, images = torch_run(params, tensors)
+    (images**2).mean().backward()
+
+    def loss(params):
+        state = initial_state(2, 15, 18)
+        return (reconstruct(Weights(params, False), state, tensors)[1] ** 2).mean()
+
+    gradient = jax.grad(loss)(params)
+    for ours, leaf in zip(jax.tree.leaves(gradient), jax.tree.leaves(theirs), strict=True):
+        expected = leaf.grad.numpy()
+        assert np.abs(np.asarray(ours) - expected).max() <= 1e-4 * np.abs(expected).max()
+
+
+def test_step_is_the_body_of_the_scan():
+    params, tensors = random_run(steps=3, batch=1, height=9, width=10)
+    state, images = initial_state(1, 9, 10), []
+    for tensor in tensors:
+        state, image = step(params, state, tensor)
+        images.append(image)
+    final, scanned = reconstruct(Weights(params, False), initial_state(1, 9, 10), tensors)
+    np.testing.assert_allclose(np.stack(images), scanned, atol=1e-6)
+    np.testing.assert_allclose(state.g2, final.g2, atol=1e-6)
+
+
+def test_bfloat16_stays_close_and_keeps_float32_state():
+    params, tensors = random_run(steps=4, batch=1, height=16, width=16)
+    weights, state = Weights(initial_params(jax.random.key(0)), False), initial_state(1, 16, 16)
+    exact = reconstruct(weights, state, tensors)[1]
+    state, images = reconstruct(weights, state, tensors, dtype=jnp.bfloat16)
+    assert images.dtype == state.g1.dtype == jnp.float32
+    assert 0 < np.abs(images - exact).max() < 0.05

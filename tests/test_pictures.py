@@ -1,0 +1,61 @@
+import jax.numpy as jnp
+import numpy as np
+import references
+
+from firenet_jax.pictures import (
+    Display,
+    display,
+    event_pictures,
+    initial_display_state,
+    unsharp_mask,
+)
+
+
+def test_unsharp_mask_equals_the_5x5_kernel():
+    image = np.random.default_rng(0).random((14, 19)).astype(np.float32)
+    np.testing.assert_allclose(
+        unsharp_mask(jnp.asarray(image), 0.3), references.unsharp(image), atol=1e-6
+    )
+
+
+def test_fixed_range_clips_and_rounds():
+    images = jnp.array([-0.5, 0.0, 0.5, 1.0, 1.5, 100.4 / 255, 100.6 / 255]).reshape(1, 1, 1, 7)
+    state = initial_display_state(1)
+    same, pictures = display(state, images, settings=Display(unsharp=0))
+    assert pictures.dtype == jnp.uint8
+    assert pictures.ravel().tolist() == [0, 0, 128, 255, 255, 100, 101]
+    np.testing.assert_array_equal(same.low, state.low)
+
+
+def test_automatic_range_is_the_running_median():
+    rng = np.random.default_rng(1)
+    images = rng.normal(rng.random((30, 1, 1, 1)), 0.4, (30, 1, 6, 7)).astype(np.float32)
+    _, pictures = display(
+        initial_display_state(1), jnp.asarray(images), settings=Display(0, auto_range=True)
+    )
+    for t, (low, high) in enumerate(references.intensity_ranges(images[:, 0])):
+        expected = np.clip(255 * (images[t, 0] - low) / (high - low), 0, 255)
+        assert np.abs(np.asarray(pictures[t, 0], float) - expected).max() <= 0.5001
+
+
+def test_automatic_range_survives_chunks_and_ignores_what_is_not_valid():
+    rng = np.random.default_rng(2)
+    images = jnp.asarray(rng.random((20, 2, 5, 5)), jnp.float32)
+    settings = Display(auto_range=True)
+    whole, expected = display(initial_display_state(2), images, settings=settings)
+    state, parts = initial_display_state(2), []
+    for start in range(0, 20, 3):
+        part = images[start : start + 3]
+        junk = jnp.full((2, 2, 5, 5), 1e9)
+        valid = jnp.arange(len(part) + 2)[:, None] < jnp.array([[len(part)] * 2])
+        state, shown = display(state, jnp.concatenate([part, junk]), valid, settings=settings)
+        parts.append(shown[: len(part)])
+    np.testing.assert_array_equal(np.concatenate(parts), expected)
+    np.testing.assert_array_equal(state.high, whole.high)
+
+
+def test_event_pictures_show_the_sign_of_the_votes():
+    tensor = jnp.zeros((2, 3, 5)).at[0, 0].set(0.2).at[1, 2].set(-0.2)
+    pictures = np.asarray(event_pictures(tensor))
+    assert pictures[0, 0].tolist() == [0, 0, 255] and pictures[1, 2].tolist() == [255, 0, 0]
+    assert (pictures == 255).all(-1).sum() == 4

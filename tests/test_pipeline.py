@@ -1,0 +1,262 @@
+import json
+import subprocess
+import sys
+import textwrap
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from firenet_jax import pipeline
+from firenet_jax.checkpoint import save_weights
+from firenet_jax.network import Weights, initial_params
+from firenet_jax.pipeline import Reconstruct, run
+from firenet_jax.pictures import Display
+from firenet_jax.video import FolderWriter
+from firenet_jax.windows import Windows
+
+HEIGHT, WIDTH = 20, 24
+
+
+def write_recording(path, count=3000, seed=0, width=WIDTH, height=HEIGHT):
+    """A text recording with a header; returns its path."""
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.integers(0, 10**6, count))
+    rows = zip(t, rng.integers(0, width, count), rng.integers(0, height, count),
+               rng.integers(0, 2, count), strict=True)  # fmt: skip
+    path.write_text(
+        f"{width} {height}\n" + "".join(f"{t / 1e6:.6f} {x} {y} {p}\n" for t, x, y, p in rows)
+    )
+    return path
+
+
+@pytest.fixture
+def weights(tmp_path):
+    path = tmp_path / "weights.npz"
+    save_weights(path, Weights(initial_params(jax.random.key(0)), True))
+    return path
+
+
+def settings(weights, recordings, output, **kwargs):
+    kwargs = {"windows": Windows(events=100), "chunk": 4} | kwargs
+    return Reconstruct(recordings, output, weights, **kwargs)
+
+
+def pictures_of(folder):
+    pictures = []
+    for path in sorted(folder.glob("frame_*.png")):
+        with Image.open(path) as image:
+            pictures.append(np.asarray(image))
+    return np.stack(pictures), (folder / "timestamps.txt").read_text()
+
+
+def test_a_recording_becomes_a_folder_of_pictures(tmp_path, weights, capsys):
+    recording = write_recording(tmp_path / "a.txt", 3050)
+    run(settings(weights, (recording,), tmp_path / "out"))
+    pictures, stamps = pictures_of(tmp_path / "out")
+    assert pictures.shape == (31, HEIGHT, WIDTH)  # the last window holds 50 events
+    times = [line.split()[0] for line in recording.read_text().splitlines()[1:]]
+    assert stamps.split() == times[99::100] + times[-1:]
+    assert "31 pictures of 3,050 events" in capsys.readouterr().out
+    assert not list(tmp_path.glob("*.partial*"))
+
+
+@pytest.mark.parametrize("batch", [1, 2, 3])
+def test_a_batch_gives_what_each_recording_gives_alone(tmp_path, weights, batch):
+    """Five recordings of different lengths and two sizes; slots are used again."""
+    lengths = (700, 2050, 400, 1200, 900)
+    paths = [write_recording(tmp_path / f"r{n}.txt", n, seed=n) for n in lengths]
+    paths.append(write_recording(tmp_path / "small.txt", 500, seed=1, width=9, height=8))
+    run(settings(weights, tuple(paths), tmp_path / "all", batch=batch))
+    for path in paths:
+        run(settings(weights, (path,), tmp_path / "alone" / path.stem))
+        together, stamps = pictures_of(tmp_path / "all" / path.stem)
+        alone, expected = pictures_of(tmp_path / "alone" / path.stem)
+        assert stamps == expected
+        assert np.abs(together.astype(int) - alone).max() <= 1
+
+
+class Interrupted(Exception):
+    pass
+
+
+def interrupt_after(monkeypatch, pictures):
+    """The program dies while it writes a picture: half of the file is there."""
+    original = FolderWriter.write
+
+    def write(self, picture, time):
+        if self.count == pictures:
+            (self.partial / f"frame_{self.count:010d}.png").write_bytes(b"half")
+            raise Interrupted
+        original(self, picture, time)
+
+    monkeypatch.setattr(FolderWriter, "write", write)
+
+
+@pytest.mark.parametrize("at", [2, 9, 30])
+def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, weights, monkeypatch, at):
+    recording = write_recording(tmp_path / "a.txt", 3050)
+    choices = {"display": Display(auto_range=True)}
+    run(settings(weights, (recording,), tmp_path / "whole", **choices))
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "RESUME_EVERY", 0)
+        interrupt_after(patch, at)
+        with pytest.raises(Interrupted):
+            run(settings(weights, (recording,), tmp_path / "out", **choices))
+    assert not (tmp_path / "out").exists()
+    done, write = [], FolderWriter.write
+
+    def counted(self, *args):
+        done.append(self.count)
+        write(self, *args)
+
+    monkeypatch.setattr(FolderWriter, "write", counted)
+    run(settings(weights, (recording,), tmp_path / "out", **choices))
+    assert done[0] == at // 4 * 4  # everything before the last finished chunk is kept
+    expected, actual = pictures_of(tmp_path / "whole"), pictures_of(tmp_path / "out")
+    np.testing.assert_array_equal(actual[0], expected[0])
+    assert actual[1] == expected[1]
+    assert len(list((tmp_path / "out").iterdir())) == 32
+
+
+def test_other_settings_do_not_continue_an_unfinished_run(tmp_path, weights, monkeypatch):
+    recording = write_recording(tmp_path / "a.txt")
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "RESUME_EVERY", 0)
+        interrupt_after(patch, 9)
+        with pytest.raises(Interrupted):
+            run(settings(weights, (recording,), tmp_path / "out"))
+    other = {"windows": Windows(events=200)}
+    with pytest.raises(ValueError, match="unfinished run of other settings"):
+        run(settings(weights, (recording,), tmp_path / "out", **other))
+    run(settings(weights, (recording,), tmp_path / "out", overwrite=True, **other))
+    assert len(pictures_of(tmp_path / "out")[0]) == 15
+
+
+@pytest.mark.slow
+def test_killed_and_run_again_gives_the_same(tmp_path, weights):
+    """SIGKILL, in a process of its own."""
+    recording = write_recording(tmp_path / "a.txt", 20_000)
+    script = textwrap.dedent(f"""
+        import os, signal, sys
+        from firenet_jax import cli, pipeline
+        pipeline.RESUME_EVERY = 0
+        if sys.argv[1] == "kill":
+            write = pipeline.FolderWriter.write
+            def killed(self, *args):
+                if self.count == 90:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                write(self, *args)
+            pipeline.FolderWriter.write = killed
+        out = sys.argv[2]
+        sys.exit(cli.main(["reconstruct", {str(recording)!r}, "-o", out,
+                           "--weights", {str(weights)!r}, "-N", "100"]))
+    """)
+    for how, name, code in [("run", "whole", 0), ("kill", "out", -9), ("run", "out", 0)]:
+        command = [sys.executable, "-c", script, how, str(tmp_path / name)]
+        assert subprocess.run(command, capture_output=True).returncode == code
+    expected, actual = pictures_of(tmp_path / "whole"), pictures_of(tmp_path / "out")
+    np.testing.assert_array_equal(actual[0], expected[0])
+    assert actual[1] == expected[1]
+
+
+def test_filters_and_time_span(tmp_path, weights):
+    recording = write_recording(tmp_path / "a.txt", 4000)
+    (tmp_path / "hot.txt").write_text("3,4\n")
+    choices = {"start": 0.25, "stop": 0.75, "flip": True, "hot_pixels": str(tmp_path / "hot.txt")}
+    run(settings(weights, (recording,), tmp_path / "out", **choices))
+    stamps = [float(line) for line in pictures_of(tmp_path / "out")[1].split()]
+    assert 0.25 < stamps[0] and stamps[-1] < 0.7501 and 19 <= len(stamps) <= 21
+    turned = run_flipped(tmp_path, weights, recording, choices)
+    assert np.abs(turned.astype(int) - pictures_of(tmp_path / "out")[0]).max() <= 1
+
+
+def run_flipped(tmp_path, weights, recording, choices):
+    """The same with the recording itself turned, and the network run upright on it."""
+    lines = recording.read_text().splitlines()
+    kept = [line.split() for line in lines[1:] if line.split()[1:3] != ["3", "4"]]
+    turned = [f"{t} {WIDTH - 1 - int(x)} {HEIGHT - 1 - int(y)} {p}" for t, x, y, p in kept]
+    path = tmp_path / "turned.txt"
+    path.write_text("\n".join([lines[0], *turned]) + "\n")
+    choices = choices | {"flip": False, "hot_pixels": None}
+    first = float(lines[1].split()[0]) - float(kept[0][0])
+    assert first == 0  # or the time span would begin elsewhere
+    run(settings(weights, (path,), tmp_path / "turned", **choices))
+    return pictures_of(tmp_path / "turned")[0]
+
+
+def test_no_events_is_an_error(tmp_path, weights):
+    recording = write_recording(tmp_path / "a.txt", 50)
+    with pytest.raises(ValueError, match="a.txt: no events"):
+        run(settings(weights, (recording,), tmp_path / "out", start=5.0))
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_the_same_name_twice_is_an_error(tmp_path, weights):
+    paths = []
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        paths.append(write_recording(tmp_path / folder / "a.txt", 50))
+    with pytest.raises(ValueError, match="two recordings are named a"):
+        run(settings(weights, tuple(paths), tmp_path / "out"))
+
+
+@pytest.mark.parametrize(
+    "choice, message",
+    [
+        ({"chunk": 0}, "chunk"), ({"fps": -1.0}, "fps"), ({"stop": -1.0}, "stop"),
+        ({"sensor_size": "240"}, "WIDTHxHEIGHT"), ({"sensor_size": "0x5"}, "WIDTHxHEIGHT"),
+    ],
+)  # fmt: skip
+def test_impossible_settings(tmp_path, weights, choice, message):
+    with pytest.raises(ValueError, match=message):
+        recording = write_recording(tmp_path / "a.txt", 50)
+        run(settings(weights, (recording,), tmp_path / "out", **choice))
+
+
+COUNT_COMPILATIONS = """
+import collections, json, sys
+import jax
+import numpy as np
+
+counts = collections.Counter()
+def listen(event, seconds, **info):
+    if event == "/jax/core/compile/backend_compile_duration":
+        counts[info["fun_name"]] += 1
+jax.monitoring.register_event_duration_secs_listener(listen)
+
+import firenet_jax as fj
+from firenet_jax import cli
+
+recording, weights, out = sys.argv[1:]
+assert cli.main(["reconstruct", recording, "-o", out, "--weights", weights, "-T", "5"]) == 0
+rec, w = fj.open_recording(recording), fj.load_weights(weights)
+state, shown = fj.initial_state(1, rec.height, rec.width), fj.initial_display_state(1)
+sizes = set()
+for tensors, times in fj.event_tensors(rec, duration=5):
+    state, images = fj.reconstruct(w, state, tensors)
+    shown, pictures = fj.display(shown, images)
+print(json.dumps(counts))
+"""
+
+
+def test_nothing_recompiles_while_200_windows_of_200_sizes_stream(tmp_path, weights):
+    """In a fresh process; a grid of 5 ms windows that hold 1, 4, 9, ... 40,000 events."""
+    sizes = np.arange(1, 201) * np.arange(1, 201)
+    rng = np.random.default_rng(0)
+    steps = [np.sort(np.append(rng.integers(0, 5000, size - 1), 0)) for size in sizes]
+    t = np.concatenate([5000 * k + step for k, step in enumerate(steps)])
+    rows = zip(t, rng.integers(0, WIDTH, t.size), rng.integers(0, HEIGHT, t.size), strict=True)
+    recording = tmp_path / "sizes.txt"
+    lines = "".join(f"{t / 1e6:.6f} {x} {y} 1\n" for t, x, y in rows)
+    recording.write_text(f"{WIDTH} {HEIGHT}\n{lines}")
+    command = [sys.executable, "-c", COUNT_COMPILATIONS, recording, weights, tmp_path / "out"]
+    done = subprocess.run([str(word) for word in command], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert len(pictures_of(tmp_path / "out")[0]) == 200
+    counts = json.loads(done.stdout.splitlines()[-1])
+    ours = ("events_to_pictures", "reconstruct", "voxelise", "display", "_set_slot", "_get_slot")
+    counted = {name: n for name, n in counts.items() if any(our in name for our in ours)}
+    assert len(counted) >= 4, counts  # the listener sees our functions by name
+    assert max(counted.values()) <= 3, counts

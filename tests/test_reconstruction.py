@@ -1,0 +1,134 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_network import random_run
+from test_tensors import random_events
+
+from firenet_jax.events import Events
+from firenet_jax.network import Weights, initial_params, initial_state
+from firenet_jax.pictures import Display
+from firenet_jax.reconstruction import (
+    Network,
+    events_to_pictures,
+    initial_session,
+    padding,
+    reconstruct,
+)
+from firenet_jax.tensors import pack
+
+
+@pytest.mark.parametrize("chunk", [1, 3, 7])
+def test_streamed_in_chunks_equals_one_scan(chunk):
+    params, tensors = random_run(steps=15, batch=1)
+    weights = Weights(params, True)
+    final, expected = reconstruct(weights, initial_state(1, 23, 31), tensors)
+    state, images = initial_state(1, 23, 31), []
+    for start in range(0, 15, chunk):
+        state, part = reconstruct(weights, state, tensors[start : start + chunk])
+        images.append(part)
+    np.testing.assert_allclose(np.concatenate(images), expected, atol=1e-6)
+    np.testing.assert_allclose(state.g1, final.g1, atol=1e-6)
+
+
+def test_batched_with_longer_and_shorter_ones_equals_alone():
+    params, tensors = random_run(steps=9, batch=3)
+    weights, lengths = Weights(params, True), (4, 9, 0)
+    valid = jnp.arange(9)[:, None] < jnp.array([lengths])
+    state, images = reconstruct(weights, initial_state(3, 23, 31), tensors, valid)
+    for b, length in enumerate(lengths):
+        alone = initial_state(1, 23, 31)
+        if length:
+            alone, expected = reconstruct(weights, alone, tensors[:length, b : b + 1])
+            np.testing.assert_allclose(images[:length, b], expected[:, 0], atol=1e-6)
+        for ours, theirs in zip(state, alone, strict=True):
+            np.testing.assert_allclose(ours[b], theirs[0], atol=1e-6)
+
+
+def test_without_recurrence_every_window_starts_from_zero():
+    params, tensors = random_run(steps=4, batch=1)
+    weights = Weights(params, True)
+    state, images = reconstruct(weights, initial_state(1, 23, 31), tensors, recurrent=False)
+    assert not state.g1.any()
+    for t in range(4):
+        expected = reconstruct(weights, initial_state(1, 23, 31), tensors[t : t + 1])[1]
+        np.testing.assert_allclose(images[t], expected[0], atol=1e-6)
+
+
+def test_weights_decide_about_normalisation():
+    params, tensors = random_run(steps=2, batch=1)
+    scaled = []
+    for normalise in (True, False):
+        weights = Weights(params, normalise)
+        run = [reconstruct(weights, initial_state(1, 23, 31), k * tensors)[1] for k in (1, 5)]
+        scaled.append(float(np.abs(run[0] - run[1]).max()))
+    assert scaled[0] < 1e-4 < scaled[1]
+
+
+def test_wrong_shapes_are_named():
+    weights = Weights(initial_params(jax.random.key(0)), True)
+    with pytest.raises(ValueError, match=r"event tensors are \(T, B, H, W, 5\)"):
+        reconstruct(weights, initial_state(1, 8, 8), jnp.zeros((2, 8, 8, 5)))
+    with pytest.raises(ValueError, match="initial_state"):
+        reconstruct(weights, initial_state(1, 8, 9), jnp.zeros((2, 1, 8, 8, 5)))
+
+
+def test_works_inside_a_users_jit_and_vmap():
+    """Weights are a pytree whose `normalise` is static."""
+    params, tensors = random_run(steps=2, batch=1)
+    expected = reconstruct(Weights(params, True), initial_state(1, 23, 31), tensors)[1]
+    images = jax.jit(lambda w, s, x: reconstruct(w, s, x)[1])(
+        Weights(params, True), initial_state(1, 23, 31), tensors
+    )
+    np.testing.assert_allclose(images, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(180, 240), (16, 32), (17, 31), (1, 1)])
+def test_padding_reaches_the_next_multiple(size):
+    for length, (before, after) in zip(size, padding(*size, 16), strict=True):
+        assert (length + before + after) % 16 == 0
+        assert 0 <= before - after <= 1 and before + after < 16
+    assert padding(180, 240, 16) == ((6, 6), (0, 0))
+    assert padding(*size, 1) == ((0, 0), (0, 0))
+
+
+def chunks_of(windows, chunk):
+    for start in range(0, len(windows), chunk):
+        part = windows[start : start + chunk]
+        rows = [[events] for events in part] + [[Events.empty()]] * (chunk - len(part))
+        yield pack(rows), np.arange(chunk)[:, None] < len(part), len(part)
+
+
+@pytest.mark.parametrize("auto_range", [False, True])
+def test_pictures_do_not_depend_on_the_chunk(auto_range):
+    rng = np.random.default_rng(0)
+    windows = [random_events(rng, 20 + 10 * k, 20, 24) for k in range(13)]
+    weights = Weights(initial_params(jax.random.key(0)), True)
+    runs = []
+    for chunk in (13, 4):
+        session, shown = initial_session(1, 20, 24, Network()), []
+        for events, valid, count in chunks_of(windows, chunk):
+            session, pictures = events_to_pictures(
+                weights, session, events, valid, height=20, width=24,
+                settings=Display(auto_range=auto_range),
+            )  # fmt: skip
+            shown.append(pictures[:count])
+        runs.append((np.concatenate(shown), session))
+    difference = np.abs(runs[0][0].astype(int) - runs[1][0])
+    assert difference.max() <= 1 and (difference > 0).mean() < 1e-3
+    for ours, theirs in zip(jax.tree.leaves(runs[0][1]), jax.tree.leaves(runs[1][1]), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-6)
+
+
+def test_preview_shows_the_events_beside_the_reconstruction():
+    events = Events.of([0, 5, 9], [1, 2, 3], [4, 5, 6], [True, False, True])
+    weights = Weights(initial_params(jax.random.key(0)), True)
+    valid = np.ones((1, 1), bool)
+    args = weights, initial_session(1, 20, 24, Network()), pack([[events]]), valid
+    _, plain = events_to_pictures(*args, height=20, width=24)
+    _, both = events_to_pictures(*args, height=20, width=24, preview=True)
+    assert both.shape == (1, 1, 20, 48, 3)
+    np.testing.assert_array_equal(both[0, 0, :, 24:], np.stack([plain[0, 0]] * 3, -1))
+    assert both[0, 0, 4, 1].tolist() == [0, 0, 255]  # ON: blue
+    assert both[0, 0, 5, 2].tolist() == [255, 0, 0]  # OFF: red
+    assert both[0, 0, 0, 0].tolist() == [255, 255, 255]

@@ -1,0 +1,137 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import references
+
+from firenet_jax.events import Events
+from firenet_jax.tensors import CAPACITIES, capacity, normalise, pack, voxelise
+
+
+def random_events(rng, count, height=12, width=17, start=10**15, span=50_000):
+    return Events.of(
+        np.sort(start + rng.integers(0, span, count)),
+        rng.integers(0, width, count),
+        rng.integers(0, height, count),
+        rng.random(count) < 0.5,
+    )
+
+
+def tensor_of(events, height=12, width=17, **kwargs):
+    return np.asarray(voxelise(pack([[events]], **kwargs), height=height, width=width))[0, 0]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 50, 3000])
+def test_equals_the_double_loop(count):
+    events = random_events(np.random.default_rng(count), count)
+    expected = references.event_tensor(events, 12, 17)
+    np.testing.assert_allclose(tensor_of(events), expected, atol=1e-5)
+
+
+def test_ragged_windows_of_several_recordings_in_one_call():
+    rng = np.random.default_rng(1)
+    rows = [[random_events(rng, n) for n in counts] for counts in [(5, 0), (700, 31), (1, 2000)]]
+    tensors = np.asarray(voxelise(pack(rows), height=12, width=17))
+    assert tensors.shape == (3, 2, 12, 17, 5)
+    for t, row in enumerate(rows):
+        for b, events in enumerate(row):
+            expected = references.event_tensor(events, 12, 17)
+            np.testing.assert_allclose(tensors[t, b], expected, atol=1e-5)
+
+
+def test_events_outside_the_sensor_vote_nowhere():
+    events = Events.of([0, 1, 2, 3, 4], [-1, 17, 3, 3, 2], [5, 5, -1, 12, 2], [1, 1, 1, 1, 1])
+    tensor = tensor_of(events)
+    np.testing.assert_allclose(tensor, references.event_tensor(events, 12, 17), atol=1e-6)
+    assert tensor[2, 2, 4] == 1 and np.abs(tensor).sum() == 1
+
+
+def test_unsorted_times_use_the_least_and_the_greatest():
+    rng = np.random.default_rng(2)
+    events = random_events(rng, 400)
+    shuffled = events.select(rng.permutation(400))
+    np.testing.assert_allclose(tensor_of(shuffled), tensor_of(events), atol=1e-5)
+
+
+def test_equal_times_all_vote_in_the_first_bin():
+    events = Events.of([7] * 10, [1] * 10, [2] * 10, [1] * 7 + [0] * 3)
+    tensor = tensor_of(events)
+    assert tensor[2, 1].tolist() == [4, 0, 0, 0, 0] and np.count_nonzero(tensor) == 1
+
+
+def test_empty_window_gives_zeros():
+    assert not tensor_of(Events.empty()).any()
+
+
+@pytest.mark.parametrize("bounds", [(0, 1000), (-500, 700), (200, 600)])
+def test_explicit_bounds(bounds):
+    """Events before and after the bounds vote by the triangle of Eq. 1, one bin away at most."""
+    events = random_events(np.random.default_rng(3), 300, start=0, span=1000)
+    expected = references.event_tensor(events, 12, 17, bounds)
+    actual = tensor_of(events, bounds=np.array([[bounds]]))
+    np.testing.assert_allclose(actual, expected, atol=1e-5)
+
+
+def test_a_window_longer_than_int32_microseconds():
+    """Two hours between two events; and a short window in the same chunk stays exact."""
+    start, hours = 1_600_000_000_000_000, 7_200_000_000
+    t = start + np.array([0, hours // 4, hours // 3, hours])
+    long = Events.of(t, [1, 2, 3, 4], [1, 2, 3, 4], [1, 0, 1, 1])
+    short = random_events(np.random.default_rng(4), 50, start=start, span=11)
+    tensors = np.asarray(voxelise(pack([[long], [short]]), height=12, width=17))[:, 0]
+    np.testing.assert_allclose(tensors[0], references.event_tensor(long, 12, 17), atol=1e-5)
+    np.testing.assert_allclose(tensors[1], references.event_tensor(short, 12, 17), atol=1e-5)
+
+
+def test_times_beyond_int32_lose_no_microsecond():
+    """As float32 seconds all these times would be one."""
+    start = 1_700_000_000_000_000
+    events = Events.of(start + np.arange(5), np.arange(5), [0] * 5, [1] * 5)
+    np.testing.assert_array_equal(tensor_of(events)[0, :5], np.eye(5))
+
+
+def test_normalise_equals_numpy_and_ignores_scale():
+    rng = np.random.default_rng(5)
+    raw = [tensor_of(random_events(rng, n)) for n in (1, 2, 40, 4000)]
+    tensors = jnp.asarray(np.stack(raw))
+    expected = np.stack([references.normalised(np.asarray(t, np.float64)) for t in raw])
+    actual = np.asarray(normalise(tensors))
+    np.testing.assert_allclose(actual, expected, atol=1e-5)
+    np.testing.assert_allclose(normalise(7.3 * tensors), actual, atol=1e-5)
+    np.testing.assert_allclose(normalise(-tensors), -actual, atol=1e-5)
+    for tensor in actual[2:]:
+        np.testing.assert_allclose(tensor[tensor != 0].std(), 1, atol=1e-4)
+
+
+def test_normalise_of_constant_and_empty_windows_is_zero():
+    constant = jnp.zeros((2, 12, 17, 5)).at[0, 3, 3:9, 0].set(2.0)
+    assert not np.asarray(normalise(constant)).any()
+
+
+def test_normalise_at_sensor_size_in_float32():
+    rng = np.random.default_rng(6)
+    raw = tensor_of(random_events(rng, 200_000, 480, 640), 480, 640)
+    expected = references.normalised(raw.astype(np.float64))
+    np.testing.assert_allclose(normalise(jnp.asarray(raw)), expected, atol=1e-4)
+
+
+def test_gradients_are_finite_through_an_empty_window():
+    gradient = jax.grad(lambda x: (normalise(x) ** 2).sum())(jnp.zeros((4, 5, 5)))
+    assert np.isfinite(gradient).all()
+
+
+def test_capacities_only_grow_and_are_few():
+    assert capacity(1) == CAPACITIES[0]
+    assert capacity(CAPACITIES[1] + 1) == CAPACITIES[2]
+    assert capacity(1, at_least=CAPACITIES[3]) == CAPACITIES[3]
+    assert capacity(CAPACITIES[-1] + 1) == 2 * CAPACITIES[-1]
+    with pytest.raises(ValueError, match="do not fit"):
+        pack([[random_events(np.random.default_rng(0), 10)]], size=9)
+
+
+def test_other_counts_do_not_recompile():
+    rng = np.random.default_rng(7)
+    voxelise.clear_cache()
+    for count in (10, 100, 1000, 9999):
+        tensor_of(random_events(rng, count))
+    assert voxelise._cache_size() == 1

@@ -1,0 +1,105 @@
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from firenet_jax.video import FolderWriter, OutputError, VideoWriter, check_output, write_video
+
+
+def ramp(count=6, height=30, width=41):
+    base = np.add.outer(np.arange(height), np.arange(width))
+    return [(base * 2 + 10 * k).astype(np.uint8) for k in range(count)]
+
+
+def decoded(path):
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def test_folder_holds_exact_pngs_and_times(tmp_path):
+    writer = FolderWriter(tmp_path / "out")
+    for k, picture in enumerate(ramp()):
+        writer.write(picture, 1_700_000_000_000_001 + k)
+        assert not (tmp_path / "out").exists()
+    writer.finish()
+    for k, picture in enumerate(ramp()):
+        with Image.open(tmp_path / "out" / f"frame_{k:010d}.png") as image:
+            np.testing.assert_array_equal(np.asarray(image), picture)
+    stamps = (tmp_path / "out" / "timestamps.txt").read_text().splitlines()
+    assert stamps[0] == "1700000000.000001" and len(stamps) == 6
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
+
+
+def test_folder_goes_on_where_it_stopped(tmp_path):
+    pictures = ramp()
+    writer = FolderWriter(tmp_path / "out")
+    for k in range(5):  # two more than will be kept
+        writer.write(pictures[k], k)
+    writer.abandon()
+    writer = FolderWriter(tmp_path / "out", done=3)
+    writer.write(pictures[3], 3)
+    writer.finish()
+    assert len(list((tmp_path / "out").glob("*.png"))) == 4
+    stamps = (tmp_path / "out" / "timestamps.txt").read_text().split()
+    assert stamps == [f"0.00000{k}" for k in range(4)]
+
+
+def test_a_finished_folder_is_replaced_whole(tmp_path):
+    for count in (6, 2):
+        write_video(tmp_path / "out", ramp(count))
+        assert len(list((tmp_path / "out").iterdir())) == count + 1
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("suffix, tolerance", [(".mp4", 6), (".gif", 1)])
+@pytest.mark.parametrize("colour", [False, True])
+def test_videos_decode_to_what_was_written(tmp_path, suffix, tolerance, colour):
+    pictures = ramp()
+    if colour:  # a few flat colours, as in the event pictures
+        pictures = [np.stack([p // 64 * 64, p * 0, p * 0 + 200], -1) for p in pictures]
+    path = tmp_path / f"video{suffix}"
+    write_video(path, pictures, fps=25)
+    frames = decoded(path)
+    assert len(frames) == 6
+    for frame, picture in zip(frames, pictures, strict=True):
+        picture = np.stack([picture] * 3, -1) if picture.ndim == 2 else picture
+        difference = np.abs(frame[:30, :41].astype(int) - picture)
+        assert np.median(difference) <= tolerance
+    with av.open(str(path)) as container:
+        assert float(container.streams.video[0].average_rate) == pytest.approx(25, rel=0.01)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_an_abandoned_video_leaves_nothing(tmp_path):
+    writer = VideoWriter(tmp_path / "video.mp4", 30)
+    writer.write(ramp()[0])
+    writer.abandon()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_on_the_way_leaves_nothing_under_the_final_name(tmp_path):
+    def pictures():
+        yield ramp()[0]
+        raise ZeroDivisionError
+
+    for name in ("video.mp4", "folder"):
+        with pytest.raises(ZeroDivisionError):
+            write_video(tmp_path / name, pictures())
+        assert not (tmp_path / name).exists()
+
+
+def test_outputs_that_cannot_be(tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "movie.mp4").write_text("")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("")
+    for name, overwrite, message in [
+        ("video.avi", False, "cannot write .avi"),
+        ("file", True, "is a file"),
+        ("movie.mp4", False, "pass --overwrite"),
+        ("mine", False, "pass --overwrite"),
+        ("mine", True, "did not write"),
+    ]:
+        with pytest.raises(OutputError, match=message):
+            check_output(tmp_path / name, overwrite)
+    check_output(tmp_path / "movie.mp4", overwrite=True)

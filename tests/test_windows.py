@@ -1,0 +1,135 @@
+import numpy as np
+import pytest
+
+from firenet_jax.events import Events, Frames, Recording, RecordingError
+from firenet_jax.windows import Windows, cut
+
+
+def recording_of(t, frames=None, chunk=7, height=2, width=3):
+    """A recording in memory whose events are numbered by x + 3 y, read in small chunks."""
+    t = np.asarray(t, np.int64)
+    events = Events.of(t, np.arange(len(t)) % 3, np.arange(len(t)) % 2, np.arange(len(t)) % 2)
+    parts = [events.select(slice(i, i + chunk)) for i in range(0, len(t), chunk)]
+    if frames is not None:
+        frames = Frames(np.asarray(frames, np.int64), lambda i: None)
+    return Recording("memory", "memory", height, width, lambda: iter(parts), len(t), frames)
+
+
+def times_of(recording, **windows):
+    return [window.events.t.tolist() for window in cut(recording, Windows(**windows))]
+
+
+@pytest.mark.parametrize("chunk", [1, 4, 7, 100])
+@pytest.mark.parametrize("count", [1, 3, 7, 50, 64, 200])
+def test_by_count_takes_every_event_once(count, chunk):
+    t = np.arange(64) * 10
+    windows = list(cut(recording_of(t, chunk=chunk, height=40, width=3), Windows(events=count)))
+    assert np.concatenate([w.events.t for w in windows]).tolist() == t.tolist()
+    assert all(len(w.events) == count for w in windows[:-1])
+    assert [w.time for w in windows] == [w.events.t[-1] for w in windows]
+
+
+@pytest.mark.parametrize("chunk", [1, 4, 7, 100])
+def test_by_count_with_overlap(chunk):
+    recording = recording_of(range(10), chunk=chunk)
+    assert times_of(recording, events=4, step=3) == [
+        [0, 1, 2, 3], [3, 4, 5, 6], [6, 7, 8, 9],
+    ]  # fmt: skip
+    assert times_of(recording, events=4, step=2)[-1] == [6, 7, 8, 9]
+    assert times_of(recording, events=4, step=4)[-1] == [8, 9]
+    assert times_of(recording_of(range(11), chunk=chunk), events=4, step=3)[-1] == [9, 10]
+
+
+def test_events_per_pixel_is_the_default():
+    recording = recording_of(range(20))
+    assert [len(w) for w in times_of(recording)] == [2] * 10  # 0.35 of 6 pixels
+    assert [len(w) for w in times_of(recording, events_per_pixel=1.0)] == [6, 6, 6, 2]
+
+
+@pytest.mark.parametrize("chunk", [1, 4, 7, 1000])
+def test_by_duration_lies_on_a_grid_that_does_not_drift(chunk):
+    rng = np.random.default_rng(0)
+    t = 123 + np.sort(rng.integers(0, 100_000, 500))
+    duration = 1.0003  # ms: a third of a microsecond off the grid each time
+    windows = list(cut(recording_of(t, chunk=chunk), Windows(duration=duration)))
+    assert np.concatenate([w.events.t for w in windows]).tolist() == t.tolist()
+    edges = t[0] + np.rint(np.arange(len(windows) + 1) * duration * 1000).astype(int)
+    for window, start, stop in zip(windows, edges[:-1], edges[1:], strict=True):
+        assert window.events.t.tolist() == t[(t >= start) & (t < stop)].tolist()
+    assert edges[-2] <= t[-1] < edges[-1]
+
+
+def test_by_duration_keeps_empty_windows_and_the_last_partial_one():
+    recording = recording_of([0, 1, 5_000, 5_400])
+    assert times_of(recording, duration=2) == [[0, 1], [], [5_000, 5_400]]
+    windows = list(cut(recording, Windows(duration=2)))
+    assert [w.time for w in windows] == [1, 4_000, 5_400]
+
+
+def test_by_duration_with_overlap():
+    recording = recording_of(range(0, 10_000, 1_000), chunk=3)
+    assert times_of(recording, duration=4, step=3) == [
+        [0, 1000, 2000, 3000], [3000, 4000, 5000, 6000], [6000, 7000, 8000, 9000],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("chunk", [1, 4, 100])
+def test_between_frames(chunk):
+    recording = recording_of(range(0, 100, 5), frames=[20, 30, 40, 60], chunk=chunk)
+    assert times_of(recording, between_frames=True) == [
+        [0, 5], [10, 15],  # the clock runs back to the first event
+        [20, 25], [30, 35], [40, 45, 50, 55],
+        [60, 65], [70, 75], [80, 85], [90, 95],  # and on after the last frame
+    ]  # fmt: skip
+
+
+def test_between_frames_starts_with_the_first_event():
+    recording = recording_of(range(31, 60), frames=[0, 10, 20, 30, 40, 50])
+    assert [w[0] for w in times_of(recording, between_frames=True)] == [31, 40, 50]
+
+
+def test_between_frames_needs_frames():
+    with pytest.raises(RecordingError, match="two frames or more"):
+        cut(recording_of(range(9)), Windows(between_frames=True))
+
+
+def test_no_events_no_windows():
+    for windows in (Windows(), Windows(duration=1)):
+        assert list(cut(recording_of([]), windows)) == []
+
+
+@pytest.mark.parametrize(
+    "fields, message",
+    [
+        ({"events": 5, "duration": 3}, "choose one"),
+        ({"events": 0}, "more than 0"),
+        ({"duration": -1}, "more than 0"),
+        ({"duration": float("nan")}, "more than 0"),
+        ({"duration": 0.0001}, "whole microseconds"),
+        ({"events": 5, "step": 2.5}, "whole number"),
+        ({"between_frames": True, "step": 2}, "fixed size"),
+    ],
+)
+def test_impossible_settings(fields, message):
+    with pytest.raises(ValueError, match=message):
+        Windows(**fields)
+
+
+@pytest.mark.parametrize("fields", [{"events": 5, "step": 6}, {"duration": 5, "step": 6}])
+def test_a_step_beyond_the_window_would_lose_events(fields):
+    with pytest.raises(ValueError, match="longer than the window"):
+        cut(recording_of(range(9)), Windows(**fields))
+
+
+@pytest.mark.parametrize("count, said", [(9, "fewer than 0.1"), (35, ""), (151, "more than 1.5")])
+def test_unusual_windows_are_said(caplog, count, said):
+    cut(recording_of([], height=10, width=10), Windows(events=count))
+    assert said in caplog.text and bool(said) == bool(caplog.text)
+
+
+def test_windows_far_larger_than_chunks_cost_linear_time():
+    """100,000 chunks into one window: joining at every chunk would copy 20 billion events."""
+    parts = [Events.of([i], [0], [0], [1]) for i in range(100_000)]
+    recording = Recording("memory", "memory", 1000, 1000, lambda: iter(parts))
+    for windows in (Windows(events=100_000), Windows(duration=1000)):
+        assert [len(w.events) for w in cut(recording, windows)] == [100_000]
