@@ -31,6 +31,7 @@ _HOME = {
     "load_weights": "checkpoint",
     "normalise": "tensors",
     "open_recording": "readers",
+    "pack": "tensors",
     "reconstruct": "reconstruction",
     "save_weights": "checkpoint",
     "step": "network",

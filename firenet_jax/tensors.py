@@ -37,7 +37,7 @@ class Packed(NamedTuple):
     x: np.ndarray  # (E,) int16
     y: np.ndarray  # (E,) int16
     p: np.ndarray  # (E,) bool
-    window: np.ndarray  # (E,) int32, t B + b; T B for unused places
+    window: np.ndarray  # (E,) int16, t B + b; T B for unused places
     t_min: np.ndarray  # (T, B) int32, microseconds modulo 2^32
     duration: np.ndarray  # (T, B) float32, microseconds, at least 1
 
@@ -67,18 +67,18 @@ def pack(
     size = capacity(counts.sum()) if size is None else size
     if counts.sum() > size:
         raise ValueError(f"{counts.sum()} events do not fit into a list of {size}")
-    if shape[0] * shape[1] >= 2**31:
+    if len(flat) >= 2**15:
         raise ValueError(f"{shape} windows are too many for one chunk")
     if bounds is None:
         bounds = np.array([(w.t.min(), w.t.max()) if len(w) else (0, 0) for w in flat], np.int64)
     t_min, t_max = np.asarray(bounds, np.int64).reshape(-1, 2).T
 
     packed = Packed(
-        t=np.empty(size, np.int32),
-        x=np.empty(size, np.int16),
-        y=np.empty(size, np.int16),
-        p=np.empty(size, bool),
-        window=np.full(size, len(flat), np.int32),
+        t=_aligned(size, np.int32),
+        x=_aligned(size, np.int16),
+        y=_aligned(size, np.int16),
+        p=_aligned(size, bool),
+        window=_aligned(size, np.int16),
         t_min=t_min.astype(np.int32).reshape(shape),
         duration=np.maximum(t_max - t_min, 1).astype(np.float32).reshape(shape),
     )
@@ -99,7 +99,17 @@ def pack(
         packed.p[start:stop] = window.p
         packed.window[start:stop] = number
         start = stop
+    packed.window[start:] = len(flat)
     return packed
+
+
+def _aligned(size: int, dtype) -> np.ndarray:
+    """An empty array that starts at a multiple of 64 bytes: XLA's CPU then takes it as it is,
+    where others are copied (1 to 2 ms for a million events)."""
+    nbytes = size * np.dtype(dtype).itemsize
+    block = np.empty(nbytes + 64, np.uint8)
+    start = -block.ctypes.data % 64
+    return block[start : start + nbytes].view(dtype)
 
 
 @partial(jax.jit, static_argnames=("height", "width"))
@@ -116,19 +126,17 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
             f"{windows} windows of {width}x{height} are too many for one chunk: use a smaller one"
         )
     # Indices of unused places reach past the end of t_min; they are clamped and later dropped.
-    since = packed.t - packed.t_min.ravel()[packed.window]  # int32: exact, modulo 2^32
-    t_star = (BINS - 1) * since.astype(jnp.float32) / packed.duration.ravel()[packed.window]
-    x, y = packed.x.astype(jnp.int32), packed.y.astype(jnp.int32)
-    seen = (0 <= x) & (x < width) & (0 <= y) & (y < height) & (packed.window < windows)
+    window, x, y = (c.astype(jnp.int32) for c in (packed.window, packed.x, packed.y))
+    since = packed.t - packed.t_min.ravel()[window]  # int32: exact, modulo 2^32
+    t_star = (BINS - 1) * since.astype(jnp.float32) / packed.duration.ravel()[window]
+    seen = (0 <= x) & (x < width) & (0 <= y) & (y < height) & (window < windows)
 
-    lower = jnp.floor(t_star)
-    upper_share = t_star - lower
-    polarity = jnp.where(packed.p, 1.0, -1.0)
-    votes = jnp.stack([polarity * (1 - upper_share), polarity * upper_share])  # (2, E)
-    bins = jnp.stack([lower, lower + 1]).astype(jnp.int32)  # (2, E)
+    # The triangle is not zero in two bins only, those around t*. (Vote, event) is (2, E).
+    bins = jnp.floor(t_star)[None] + jnp.array([[0.0], [1.0]])
+    votes = jnp.where(packed.p, 1.0, -1.0)[None] * (1 - jnp.abs(bins - t_star[None]))
     # One plane a bin, so that consecutive events, close in time, vote close in memory.
-    pixel = (packed.window * height + y) * width + x
-    place = bins * (windows * plane) + pixel[None]
+    pixel = (window * height + y) * width + x
+    place = bins.astype(jnp.int32) * (windows * plane) + pixel[None]
     # A place past the end is dropped by segment_sum; a negative one would wrap round.
     places = BINS * windows * plane
     place = jnp.where(seen[None] & (0 <= bins) & (bins < BINS), place, places)

@@ -11,8 +11,8 @@ from PIL import Image
 from firenet_jax import pipeline
 from firenet_jax.checkpoint import save_weights
 from firenet_jax.network import Weights, initial_params
-from firenet_jax.pipeline import Reconstruct, run
 from firenet_jax.pictures import Display
+from firenet_jax.pipeline import Reconstruct, run
 from firenet_jax.video import FolderWriter
 from firenet_jax.windows import Windows
 

@@ -61,7 +61,9 @@ def _layout(path: Path, file: h5py.File) -> str:
                 return layout
     if f"{MVSEC}/events" in file:
         return "MVSEC"
-    found = [*file, *(f"events/{name}" for name in events or () if isinstance(events, h5py.Group))]
+    found = [*file]
+    if isinstance(events, h5py.Group):
+        found += [f"events/{name}" for name in events]
     raise RecordingError(
         f"{path}: holds {', '.join(found) or 'nothing'}, expected the columns events/xs, ys, ts, "
         "ps (event_cnn_minimal), events/x, y, t, p (DSEC), or davis/left/events (MVSEC)"

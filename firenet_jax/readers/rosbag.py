@@ -28,6 +28,7 @@ ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
 IMAGE = "sensor_msgs/msg/Image"
 WORDS = 1 << 18  # EVT3 words decoded at once: messages are tiny
+ORDERS = {"<": "little", ">": "big"}
 CHANNELS = {"mono8": 1, "8UC1": 1, "mono16": 1, "16UC1": 1, "rgb8": 3, "bgr8": 3}
 
 
@@ -38,16 +39,17 @@ def matches(path: Path) -> bool:
 
 
 def read(path: Path) -> Source:
+    ros2 = not _is_ros1(path)
     with reading(path, Exception), _bag(path) as bag:
         topics = {entry.topic: entry.msgtype for entry in bag.connections}
         topic = _only(path, [t for t, kind in topics.items() if kind in ARRAYS + PACKETS], topics)
-        size = next((_size(path, raw) for _, raw in _raw(bag, topic)), None)
+        size = next((_size(_Message(raw, ros2)) for _, raw in _raw(bag, topic)), None)
         images = [t for t, kind in topics.items() if kind == IMAGE]
         # Of several cameras' images, those of the same name: /dvs/events, /dvs/image_raw.
         image_topic = max(images, key=lambda name: len(commonprefix([name, topic])), default=None)
         frames = _frames(path, bag, image_topic)
     return Source(
-        "ROS 1 bag" if _is_ros1(path) else "ROS 2 bag",
+        "ROS 2 bag" if ros2 else "ROS 1 bag",
         lambda: joined(_events(path, topic, topics[topic] in ARRAYS)),
         size,
         frames=frames,
@@ -84,10 +86,10 @@ def _raw(bag, topic: str, start: int | None = None) -> Iterator[tuple[int, bytes
 class _Message:
     """The fields of a serialised message, in their order."""
 
-    def __init__(self, path: Path, raw: bytes):
-        self.raw, self.ros2 = raw, not _is_ros1(path)
+    def __init__(self, raw: bytes, ros2: bool):
+        self.raw, self.ros2 = raw, ros2
         self.at = self.start = 4 if self.ros2 else 0  # CDR tells its byte order first
-        self.order = "big" if self.ros2 and raw[1] == 0 else "little"
+        self.order = ">" if self.ros2 and raw[1] == 0 else "<"
 
     def number(self, size: int) -> int:
         if self.ros2:
@@ -95,7 +97,7 @@ class _Message:
         self.at += size
         if self.at > len(self.raw):
             raise ValueError("a message ends too early")
-        return int.from_bytes(self.raw[self.at - size : self.at], self.order)
+        return int.from_bytes(self.raw[self.at - size : self.at], ORDERS[self.order])
 
     def bytes(self) -> bytes:
         size = self.number(4)
@@ -120,16 +122,15 @@ def _microseconds(seconds, nanoseconds):
     return seconds * 1_000_000 + (nanoseconds + 500) // 1000
 
 
-def _size(path: Path, raw: bytes) -> tuple[int, int]:
-    message = _Message(path, raw)
+def _size(message: _Message) -> tuple[int, int]:
     message.header()
     return message.number(4), message.number(4)
 
 
 def _events(path: Path, topic: str, arrays: bool) -> Iterator[Events]:
-    row = 0
+    row, ros2 = 0, not _is_ros1(path)
     with reading(path, Exception), _bag(path) as bag:
-        messages = (_Message(path, raw) for _, raw in _raw(bag, topic))
+        messages = (_Message(raw, ros2) for _, raw in _raw(bag, topic))
         for columns in _array_columns(messages) if arrays else _packet_columns(path, messages):
             events = to_events(path, row, *columns)
             row += len(events)
@@ -140,30 +141,20 @@ def _array_columns(messages: Iterator[_Message]) -> Iterator[tuple[np.ndarray, .
     for message in messages:
         message.header()
         _, _, count = message.number(4), message.number(4), message.number(4)
-        o = ">" if message.order == "big" else "<"
+        if not count:
+            continue
+        data, offsets, size = message.raw[message.at :], (0, 2, 4, 8, 12), 13
         if message.ros2:
-            # An event takes 2+2+4+4+1 bytes and is aligned to 2, its time to 4: behind the first
-            # that makes 16 bytes from time to time, with x and y in the 6 bytes before.
-            names, offsets = ("s", "n", "p", "next_x", "next_y"), (4, 8, 12, 14, 16)
-            kinds, stride = (o + "u4", o + "u4", "u1", o + "u2", o + "u2"), 16
-        else:
-            names, offsets = ("x", "y", "s", "n", "p"), (0, 2, 4, 8, 12)
-            kinds, stride = (o + "u2", o + "u2", o + "u4", o + "u4", "u1"), 13
-        # The last event may end before its stride does.
-        packed = bytes(message.raw[message.at :]).ljust(count * stride + 4, b"\0")
-        if len(message.raw) < message.at + (count and (count - 1) * stride + 13):
-            raise ValueError("a message ends too early")
-        fields = {
-            name: np.ndarray(count, kind, packed, offset, (stride,))
-            for name, kind, offset in zip(names, kinds, offsets, strict=True)
-        }
-        if message.ros2 and count:
-            first = np.frombuffer(packed, o + "u2", 2)
-            fields["x"] = np.append(first[0], fields["next_x"][:-1])
-            fields["y"] = np.append(first[1], fields["next_y"][:-1])
-        if count:
-            t = _microseconds(fields["s"].astype(np.int64), fields["n"].astype(np.int64))
-            yield t, fields["x"], fields["y"], fields["p"]
+            # x and y are aligned to 2, the time to 4: two bytes of nothing lie before the time of
+            # every event but the first, and one behind the polarity of every event but the last.
+            data, offsets, size = b"%b\0\0%b\0" % (data[:4], data[4:]), (0, 2, 6, 10, 14), 16
+        formats = [message.order + kind for kind in ("u2", "u2", "u4", "u4", "u1")]
+        event = np.dtype(
+            {"names": list("xysnp"), "formats": formats, "offsets": offsets, "itemsize": size}
+        )
+        events = np.frombuffer(data, event, count)
+        t = _microseconds(events["s"].astype(np.int64), events["n"].astype(np.int64))
+        yield t, events["x"], events["y"], events["p"]
 
 
 class _Packet(NamedTuple):
@@ -226,9 +217,9 @@ DECODERS = {"evt3": _evt3, "mono": _mono}
 def _frames(path: Path, bag, topic: str | None) -> Frames | None:
     if topic is None:
         return None
-    stamps, recorded = [], []
+    stamps, recorded, ros2 = [], [], not _is_ros1(path)
     for time, raw in _raw(bag, topic):
-        message = _Message(path, raw)
+        message = _Message(raw, ros2)
         stamps.append(message.header())
         if not recorded and (encoding := _encoding(message)) not in CHANNELS:
             logger.warning("%s: images of %s are %s: no frames", path, topic, encoding)
@@ -238,7 +229,7 @@ def _frames(path: Path, bag, topic: str | None) -> Frames | None:
     def read(i: int) -> np.ndarray:
         with reading(path, Exception), _bag(path) as bag:
             for _, raw in _raw(bag, topic, recorded[i]):
-                message = _Message(path, raw)
+                message = _Message(raw, ros2)
                 if message.header() == stamps[i]:
                     return _picture(path, message)
         raise RecordingError(f"{path}: frame {i + 1} of {topic} is not there any more")

@@ -1,0 +1,59 @@
+"""Functions -> times, side by side: what the benchmark scripts share.
+
+Machines are noisy, so methods are timed in turn, A B C A B C ..., and compared by the ratio of
+their medians within one run.
+"""
+
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def interleaved(methods: dict[str, Callable[[], object]], runs: int) -> dict[str, list[float]]:
+    """Seconds of each run of each method, which must return when the work is done."""
+    for method in methods.values():  # compilation, caches
+        method()
+    seconds: dict[str, list[float]] = {name: [] for name in methods}
+    for _ in range(runs):
+        for name, method in methods.items():
+            start = time.perf_counter()
+            method()
+            seconds[name].append(time.perf_counter() - start)
+    return seconds
+
+
+def table(seconds: dict[str, list[float]], base: str) -> list[dict]:
+    """Prints and returns the median, spread and ratio to `base` of each method."""
+    rows = []
+    reference = statistics.median(seconds[base])
+    print(f"{'method':34} {'median ms':>10} {'min':>9} {'max':>9} {'times ' + base:>14}")
+    for name, runs in seconds.items():
+        median = statistics.median(runs)
+        row = {"method": name, "median_ms": 1e3 * median, "min_ms": 1e3 * min(runs),
+               "max_ms": 1e3 * max(runs), "ratio": median / reference}  # fmt: skip
+        rows.append(row)
+        print(f"{name:34} {row['median_ms']:10.2f} {row['min_ms']:9.2f} {row['max_ms']:9.2f} "
+              f"{row['ratio']:14.2f}")  # fmt: skip
+    return rows
+
+
+def save(name: str, results: dict) -> None:
+    """Writes results/<name>.json with what the numbers depend on."""
+    RESULTS.mkdir(exist_ok=True)
+    machine = {
+        "platform": platform.platform(terse=True),
+        "processors": os.cpu_count(),
+        "device": jax.devices()[0].device_kind,
+        "jax": jax.__version__,
+    }
+    path = RESULTS / f"{name}.json"
+    path.write_text(json.dumps({"machine": machine, **results}, indent=1) + "\n")
+    print(f"written: {path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path}")

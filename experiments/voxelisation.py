@@ -1,0 +1,108 @@
+"""Events on the host -> finished event tensor: our segment_sum against PyTorch and numpy.
+
+Question: how long do 1,000,000 events take from int64/int16 columns on the host to a 640x480x5
+tensor? Two PyTorch versions: rpg_e2vid's steps (events as one float64 array, masks, two
+index_add_), and the leanest index_add_ we could write. Expected: ours at least 4 times faster than
+the former and 20 times faster than numpy.add.at.
+
+    python experiments/voxelisation.py            under a minute; needs torch
+"""
+
+import argparse
+
+import numpy as np
+import torch
+from harness import interleaved, save, table
+
+from firenet_jax.events import Events
+from firenet_jax.tensors import pack, voxelise
+
+HEIGHT, WIDTH, BINS = 480, 640, 5
+
+
+def ours(events: Events):
+    packed = pack([[events]])
+    return voxelise(packed, height=HEIGHT, width=WIDTH).block_until_ready()
+
+
+def torch_original(events: Events):
+    """rpg_e2vid's steps in our words: (N, 4) float64 rows, time scaled, two masked index_add_."""
+    with torch.no_grad():
+        columns = [events.t.astype(np.float64), events.x, events.y, events.p]
+        rows = torch.from_numpy(np.stack(columns, axis=1))
+        grid = torch.zeros(BINS * HEIGHT * WIDTH)
+        times = (BINS - 1) * (rows[:, 0] - rows[0, 0]) / (rows[-1, 0] - rows[0, 0])
+        x, y = rows[:, 1].long(), rows[:, 2].long()
+        polarity = rows[:, 3].float()
+        polarity[polarity == 0] = -1
+        lower = torch.floor(times)
+        share = (times - lower).float()
+        lower = lower.long()
+        for bins, votes in ((lower, polarity * (1 - share)), (lower + 1, polarity * share)):
+            valid = (bins >= 0) & (bins < BINS)
+            place = x[valid] + y[valid] * WIDTH + bins[valid] * WIDTH * HEIGHT
+            grid.index_add_(0, place, votes[valid])
+        return grid.view(BINS, HEIGHT, WIDTH)
+
+
+def torch_lean(events: Events):
+    """As few passes and bytes as PyTorch needs: one spare plane takes the votes past the end."""
+    with torch.no_grad():
+        t = torch.from_numpy(events.t)
+        times = (t - t[0]).to(torch.float32) * ((BINS - 1) / float(t[-1] - t[0]))
+        lower = times.floor()
+        share = times - lower
+        polarity = torch.from_numpy(events.p).to(torch.float32).mul_(2).sub_(1)
+        place = torch.from_numpy(events.y).int() * WIDTH + torch.from_numpy(events.x)
+        place += lower.int() * (WIDTH * HEIGHT)
+        grid = torch.zeros((BINS + 1) * HEIGHT * WIDTH)
+        grid.index_add_(0, place, polarity * (1 - share))
+        grid.index_add_(0, place + WIDTH * HEIGHT, polarity * share)
+        return grid.view(BINS + 1, HEIGHT, WIDTH)[:BINS]
+
+
+def numpy_add_at(events: Events):
+    t = events.t
+    times = (BINS - 1) * (t - t[0]) / float(t[-1] - t[0])
+    lower = times.astype(np.int64)
+    share = times - lower
+    polarity = np.where(events.p, 1.0, -1.0)
+    place = events.x + events.y.astype(np.int64) * WIDTH + lower * (WIDTH * HEIGHT)
+    grid = np.zeros(BINS * HEIGHT * WIDTH, np.float32)
+    np.add.at(grid, place, polarity * (1 - share))
+    inside = lower + 1 < BINS
+    np.add.at(grid, place[inside] + WIDTH * HEIGHT, (polarity * share)[inside])
+    return grid.reshape(BINS, HEIGHT, WIDTH)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--events", type=int, default=1_000_000)
+    parser.add_argument("--runs", type=int, default=20)
+    options = parser.parse_args()
+    rng = np.random.default_rng(0)
+    events = Events.of(
+        10**15 + np.sort(rng.integers(0, 50_000, options.events)),
+        rng.integers(0, WIDTH, options.events),
+        rng.integers(0, HEIGHT, options.events),
+        rng.random(options.events) < 0.5,
+    )
+    methods = {
+        "ours": ours,
+        "torch index_add_ (original steps)": torch_original,
+        "torch index_add_ (leanest)": torch_lean,
+        "numpy.add.at": numpy_add_at,
+    }
+    expected = np.moveaxis(numpy_add_at(events), 0, -1)
+    for name, method in methods.items():
+        tensor = np.asarray(method(events))
+        tensor = tensor[0, 0] if name == "ours" else np.moveaxis(tensor, 0, -1)
+        print(f"{name:34} largest difference from numpy {np.abs(tensor - expected).max():.1e}")
+    seconds = interleaved({n: lambda m=m: m(events) for n, m in methods.items()}, options.runs)
+    rows = table(seconds, "ours")
+    results = {"events": options.events, "runs": options.runs, "torch": torch.__version__}
+    save("voxelisation", {**results, "rows": rows})
+
+
+if __name__ == "__main__":
+    main()

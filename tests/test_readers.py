@@ -1,0 +1,960 @@
+"""Readers: small files of every format, written here; what must be refused; the real recordings.
+
+Expected events are the arrays below, or bits put together by hand from the formats' descriptions.
+"""
+
+import builtins
+import gzip
+import importlib.util
+import io
+import struct
+import sys
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from firenet_jax import readers
+from firenet_jax.events import Events, RecordingError, concatenate
+from firenet_jax.readers import dat, evt3, hdf5, ncaltech, open_recording, rosbag, text
+
+T = np.array([1000, 1500, 1500, 20_000, 3_000_007])  # microseconds
+X = np.array([0, 5, 319, 7, 2])
+Y = np.array([3, 0, 8, 239, 1])
+P = np.array([1, 0, 0, 1, 1], bool)
+EVENTS = list(zip(T.tolist(), X.tolist(), Y.tolist(), P.astype(int).tolist(), strict=True))
+ROWS = [f"{t / 1e6:.6f} {x} {y} {p}" for t, x, y, p in EVENTS]
+FRAME = np.arange(12, dtype=np.uint8).reshape(3, 4) * 20
+
+
+def events_of(path, size=(240, 320)) -> Events:
+    return concatenate([Events.empty(), *open_recording(path, size).events()])
+
+
+def check(path, t=T, x=X, y=Y, p=P, size=(240, 320)):
+    events = events_of(path, size)
+    for name, kind, expected in zip("txyp", ("i8", "i2", "i2", "?"), (t, x, y, p), strict=True):
+        column = getattr(events, name)
+        assert column.dtype == kind
+        np.testing.assert_array_equal(column, expected)
+
+
+def refused(path, *said, size=(240, 320)):
+    """Reading raises RecordingError, in one sentence that names the file and says all of this."""
+    with pytest.raises(RecordingError) as error:
+        events_of(path, size)
+    message = str(error.value)
+    assert str(path) in message and "\n" not in message
+    for words in said:
+        assert words in message, message
+
+
+def write(path: Path, content: str | bytes) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def without(monkeypatch, package: str):
+    """As if the package were not installed."""
+    for name in [name for name in sys.modules if name.split(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    real = builtins.__import__
+
+    def refusing(name, *args, **kwargs):
+        if name.split(".")[0] == package:
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    load = importlib.import_module
+    monkeypatch.setattr(builtins, "__import__", refusing)
+    monkeypatch.setattr(importlib, "import_module", lambda name: refusing(name) and load(name))
+
+
+# ---------------------------------------------------------------- any format
+
+
+def test_what_is_no_recording(tmp_path):
+    refused(tmp_path / "missing.txt", "no such file")
+    refused(write(tmp_path / "empty.txt", ""), "is empty")
+    refused(write(tmp_path / "film.mp4", b"x"), "not a recording of a known format")
+    refused(tmp_path, "not a recording of a known format")
+
+
+def test_sensor_size_is_inferred_with_a_notice(tmp_path, caplog):
+    path = write(tmp_path / "events.txt", "\n".join(ROWS))
+    recording = open_recording(path)
+    assert (recording.height, recording.width) == (240, 320)
+    assert "320x240 inferred" in caplog.text
+    with pytest.raises(RecordingError, match="holds no events"):
+        open_recording(write(tmp_path / "none.txt", "\n\n"))
+
+
+def test_numbers_that_events_cannot_hold():
+    good = np.arange(3), np.arange(3), np.arange(3), np.arange(3) % 2
+    for column, value, said in (
+        (0, [0, 1, np.nan], "event 13: the time is nan"),
+        (0, [0, 1, np.inf], "event 13: the time is inf"),
+        (0, np.array([0, 2**63, 1], np.uint64), "event 12: the time is 9223372036854775808"),
+        (1, [0, 40_000, 1], "event 12: x is 40000, expected a coordinate below 32768"),
+        (1, [0, 1, 0.5], "event 13: x is 0.5, expected a whole number"),
+        (2, np.array([-40_000, 0, 1]), "event 11: y is -40000"),
+        (2, [0, np.nan, 1], "event 12: y is nan"),
+        (3, [0, 1, 2], "event 13: the polarity is 2, expected 0 or 1"),
+        (3, [0, 0.5, 1], "event 12: the polarity is 0.5"),
+        (3, np.array([0, 255, 1], np.uint8), "event 12: the polarity is 255"),
+        (0, np.array(["a", "b", "c"]), "the time is stored as <U1"),
+    ):
+        columns = [*good]
+        columns[column] = np.asarray(value)
+        with pytest.raises(RecordingError) as error:
+            readers.to_events(Path("file"), 10, *columns)
+        assert said in str(error.value)
+
+
+def test_unwrap():
+    wrapped = np.array([250, 255, 3, 2, 200, 255, 0])
+    expected = np.array([250, 255, 259, 258, 456, 511, 512])
+    np.testing.assert_array_equal(readers.unwrap(wrapped, 8, 0), expected)
+    first = readers.unwrap(wrapped[:3], 8, 0)
+    pieces = [*first, *readers.unwrap(wrapped[3:], 8, int(first[-1]))]
+    np.testing.assert_array_equal(pieces, expected)
+    assert readers.unwrap(np.array([], np.int64), 8, 5).size == 0
+
+
+def test_joined():
+    chunks = [Events.of([i] * 3, [0] * 3, [0] * 3, [0] * 3) for i in range(5)]
+    assert [len(chunk) for chunk in readers.joined(chunks, 6)] == [6, 6, 3]
+    assert list(readers.joined([Events.empty()])) == []
+
+
+def test_frames_of_other_kinds():
+    path = Path("file")
+    np.testing.assert_array_equal(readers.to_frame(FRAME[..., None], path), FRAME)
+    np.testing.assert_array_equal(readers.to_frame(FRAME.astype(np.uint16) << 8, path), FRAME)
+    np.testing.assert_array_equal(readers.to_frame(np.stack([FRAME] * 3, -1), path), FRAME)
+    with pytest.raises(RecordingError, match="float64 of shape"):
+        readers.to_frame(FRAME / 255, path)
+
+
+@pytest.mark.parametrize(
+    "name, package", [("a.raw", "faery"), ("a.aedat4", "faery"), ("a.bag", "rosbags")]
+)
+def test_missing_extra(tmp_path, monkeypatch, name, package):
+    without(monkeypatch, package)
+    path = write(tmp_path / name, "% evt 3.0\n")
+    refused(path, package, 'pip install "firenet-jax[formats]"')
+
+
+# ---------------------------------------------------------------- text
+
+US = [f"{t} {x} {y} {p}" for t, x, y, p in EVENTS]
+XYPT = [f"{x},{y},{p},{t}" for t, x, y, p in EVENTS]
+TEXTS = {
+    "plain": "\n".join(ROWS) + "\n",
+    "size": "320 240\n" + "\n".join(ROWS) + "\n",
+    "no end": "320 240\n" + "\n".join(ROWS),
+    "CRLF": "320 240\r\n" + "\r\n".join(ROWS) + "\r\n",
+    "empty lines": "\n320 240\n\n" + "\n\n".join(ROWS) + "\n  \n\n",
+    "tabs": "\n".join(ROWS).replace(" ", "\t"),
+    "commas": "\n".join(ROWS).replace(" ", ","),
+    "commas, spaces": "\n".join(ROWS).replace(" ", " , "),
+    "runs of spaces": "\n".join(f"  {row} " for row in ROWS).replace(" ", "   "),
+    "tabs and spaces": "\n".join(ROWS).replace(" ", " \t"),
+    "byte order mark": "\ufeff" + "\n".join(ROWS),
+    "byte order mark, size": "\ufeff320 240\n" + "\n".join(ROWS),
+    "exponents": "\n".join(f"{t / 1e6:.9e} {x}.0 {y}e0 {p}.0" for t, x, y, p in EVENTS),
+    "minus one": "\n".join(row[:-1] + row[-1].replace("0", "-1") for row in ROWS),
+    "names": "x,y,note,p,t\n" + "\n".join(f"{x},{y},?,{p},{t / 1e6}" for t, x, y, p in EVENTS),
+    "names with units": '# by hand\n"timestamp (s)", x, y, polarity\n'
+    + "\n".join(ROWS).replace(" ", ","),
+    "names with spaces": "# t x y p\n" + "\n".join(ROWS),
+}
+
+
+@pytest.mark.parametrize("content", TEXTS.values(), ids=TEXTS)
+def test_text(tmp_path, content):
+    path = write(tmp_path / "events.txt", content)
+    check(path)
+    recording = open_recording(path, None if "320 240" in content else (240, 320))
+    assert (recording.height, recording.width, recording.format) == (240, 320, "text")
+
+
+def test_text_in_microseconds(tmp_path, caplog):
+    check(write(tmp_path / "a.csv", "t,x,y,p\n" + "\n".join(US).replace(" ", ",")))
+    assert "read as microseconds" in caplog.text
+    path = write(tmp_path / "metavision.csv", "%geometry:320,240\n" + "\n".join(XYPT))
+    check(path, size=None)
+    caplog.clear()
+    check(write(tmp_path / "seconds.txt", "\n".join(ROWS)))
+    assert not caplog.text
+
+
+@pytest.mark.parametrize("block", [20, 33, 64, 1000])
+@pytest.mark.parametrize("content", ["plain", "size", "no end", "empty lines", "CRLF"])
+def test_text_in_blocks(tmp_path, monkeypatch, block, content):
+    monkeypatch.setattr(text, "BLOCK", block)
+    check(write(tmp_path / "events.txt", TEXTS[content]))
+
+
+def test_compressed_text(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("folder/events.txt", TEXTS["size"])
+        archive.writestr("__MACOSX/folder/._events.txt", "x")
+    check(tmp_path / "a.zip", size=None)
+    with gzip.open(tmp_path / "a.txt.gz", "wb") as file:
+        file.write(TEXTS["size"].encode())
+    check(tmp_path / "a.txt.gz", size=None)
+
+
+def test_damaged_compressed_text(tmp_path):
+    content = "320 240\n" + "".join(f"{i / 1e6:.6f} {i % 320} 7 1\n" for i in range(5000))
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("events.txt", content)
+    whole = (tmp_path / "a.zip").read_bytes()
+    refused(write(tmp_path / "cut.zip", whole[:-100]), "cannot be read")
+    refused(write(tmp_path / "no.zip", "not a zip"), "cannot be read")
+    crc = struct.pack("<I", zipfile.crc32(content.encode()))
+    assert whole.count(crc) == 2  # before the data and in the list at the end
+    refused(write(tmp_path / "crc.zip", whole.replace(crc, b"\0" * 4)), "Bad CRC-32")
+    packed = gzip.compress(content.encode())
+    refused(write(tmp_path / "cut.txt.gz", packed[: len(packed) // 2]), "cannot be read")
+    with zipfile.ZipFile(tmp_path / "two.zip", "w") as archive:
+        archive.writestr("a.txt", content)
+        archive.writestr("b.txt", content)
+    refused(tmp_path / "two.zip", "holds 2 text files (a.txt, b.txt) where one is expected")
+    with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
+        archive.writestr("a.png", content)
+        archive.writestr("b.png", content)
+    refused(tmp_path / "other.zip", "holds 0 text files where one is expected")
+
+
+@pytest.mark.parametrize(
+    "content, said",
+    [
+        ("0.1 1 2 1\n\n0.2 1 2 1 9\n", "line 3: five words instead of four: '0.2 1 2 1 9'"),
+        ("320 240\n0.1 1 2 1\n0.2 1 2\n", "line 3: three words instead of four"),
+        ("0.1 1 2 1\n0.2\n", "line 2: one word instead of four"),
+        ("t,x,y,p\n.1,1,2,1\n.2,1,2,1,7\n", "line 3: five words instead of four"),
+        ("0.1 1 2 1\nnan 1 2 1\n", "line 2: the time is nan"),
+        ("0.1 1 2 1\n\ninf 1 2 1\n", "line 3: the time is inf"),
+        ("0.1 1 2 1\n0,2 1 2 1\n", "line 2: the time is 0,2, expected a number of seconds"),
+        ("1 1 2 1\n0.5 1 2 1\n" * 600, "line 2"),
+        ("1 1 2 1\n" * 1000 + "1.5 1 2 1\n", "line 1001: the time is 1.5, expected whole micro"),
+        ("0.1 1 2 1\n0.2 one 2 1\n", "line 2: x is one, expected a whole number below 32768"),
+        ("0.1 1 2 1\n0.2 1 2.5 1\n" + "0.2 1 2 1\n" * 9, "line 2: y is 2.5"),
+        ("0.1 1 2 1\n0.2 1 99999999999 1\n", "line 2: y is 99999999999"),
+        ("0.1 1 2 1\n\n0.2 40000 2 1\n", "line 3: x is 40000"),
+        ("0.1 1 2 1\n0.2 1 2 7\n", "line 2: the polarity is 7, expected 0 or 1"),
+        ("0.1 1 2 1\n0.2 1 2 True\n", "line 2: the polarity is True, expected 0 or 1"),
+        ("0.1 1 2 1\n\n0.2 -1 2 1\n", "line 3: x is -1, but coordinates are 0 or more"),
+        ("0.1 1 2 1\n0.2 1 240 1\n", "line 2: y is 240, outside the sensor of 320x240"),
+        ("320 240\n\n0.1 1 2 1\n0.3 1 2 1\n0.2 1 2 1\n", "line 5: time runs backwards"),
+        ("hello\n0.1 1 2 1\n", "line 1: 'hello' where numbers"),
+        ("t,x,y\n0.1,1,2\n", "line 1: 't,x,y' where numbers, or the names of columns"),
+        ("\x00\x01\x02\x03", "line 1"),
+        (b"\xff\xfe0\x001\x00", "line 1"),
+    ],
+)
+def test_wrong_text(tmp_path, content, said):
+    refused(write(tmp_path / "events.txt", content), said)
+
+
+def test_wrong_lines_far_into_a_text(tmp_path, monkeypatch):
+    monkeypatch.setattr(text, "BLOCK", 100)
+    lines = ["320 240", *(f"{i / 1e6:.6f} {i % 320} 7 1" for i in range(50))]
+
+    def with_line(number: int, line: str) -> Path:
+        changed = lines[: number - 1] + ["", line] + lines[number:]
+        return write(tmp_path / "events.txt", "\n".join(changed))
+
+    refused(with_line(40, "0.000039 1 2"), "line 41: three words")
+    refused(with_line(40, "nan 1 2 1"), "line 41: the time is nan")
+    refused(with_line(40, "0.000039 -3 2 1"), "line 41: x is -3")
+    for number in range(30, 40):  # across the boundary of two blocks, too
+        refused(with_line(number, "0.000002 1 2 1"), f"line {number + 1}: time runs backwards")
+    refused(write(tmp_path / "endless.txt", "0" * 100_000), "line 1: does not end")
+
+
+# ---------------------------------------------------------------- ECD
+
+
+def ecd_files() -> dict[str, bytes]:
+    files = {
+        "events.txt": b"0.001 0 2 1\n0.0015 3 0 0\n",
+        "images.txt": b"0.001 images/a.png\n0.0025 images/b.png\n",
+        "calib.txt": b"1 2 3\n",
+    }
+    for name, picture in (("a", FRAME), ("b", FRAME[::-1])):
+        Image.fromarray(picture).save(buffer := io.BytesIO(), "png")
+        files[f"images/{name}.png"] = buffer.getvalue()
+    return files
+
+
+def ecd_folder(path: Path) -> Path:
+    for name, content in ecd_files().items():
+        write(path / name, content)
+    return path
+
+
+def check_ecd(path: Path):
+    check(path, [1000, 1500], [0, 3], [2, 0], [1, 0], size=None)
+    recording = open_recording(path)
+    assert (recording.height, recording.width) == (3, 4)
+    np.testing.assert_array_equal(recording.frames.times, [1000, 2500])
+    np.testing.assert_array_equal(recording.frames.read(0), FRAME)
+    np.testing.assert_array_equal(recording.frames.read(1), FRAME[::-1])
+
+
+def test_ecd_folder(tmp_path):
+    check_ecd(ecd_folder(tmp_path))
+
+
+@pytest.mark.parametrize("folder", ["", "slider_depth/"])
+def test_ecd_zip(tmp_path, folder):
+    with zipfile.ZipFile(tmp_path / "slider.zip", "w") as archive:
+        for name, content in ecd_files().items():
+            archive.writestr(folder + name, content)
+    check_ecd(tmp_path / "slider.zip")
+
+
+def test_ecd_without_frames(tmp_path, caplog):
+    folder = ecd_folder(tmp_path)
+    (folder / "images/a.png").unlink()
+    assert open_recording(folder, (3, 4)).frames is None
+    assert "images/a.png, which is not there" in caplog.text
+    (folder / "images.txt").unlink()
+    assert open_recording(folder, (3, 4)).frames is None
+
+
+def test_wrong_ecd(tmp_path):
+    folder = ecd_folder(tmp_path)
+    write(folder / "events.txt", "0.1 1 2 1\n0.05 1 2 1\n")
+    refused(folder, "events.txt, line 2: time runs backwards", size=None)
+    write(folder / "images/b.png", b"no picture")
+    with pytest.raises(RecordingError, match="b.png: cannot be read"):
+        open_recording(folder).frames.read(1)
+    for line in ("nan images/a.png", "0.1", "x images/a.png"):
+        write(folder / "images.txt", f"0.0 images/a.png\n{line}\n")
+        refused(folder, "images.txt, line 2")
+
+
+# ---------------------------------------------------------------- HDF5
+
+
+def write_cnn(path: Path, t=T / 1e6, x=X, y=Y, p=P, size=(240, 320)) -> Path:
+    with h5py.File(path, "w") as file:
+        for name, column in zip(("ts", "xs", "ys", "ps"), (t, x, y, p), strict=True):
+            file[f"events/{name}"] = column
+        file["images/image000000000"] = FRAME
+        file["images/image000000001"] = FRAME[::-1]
+        for i, name in enumerate(sorted(file["images"])):
+            file["images"][name].attrs["timestamp"] = i / 10
+        if size:
+            file.attrs["sensor_resolution"] = size
+    return path
+
+
+def check_frames(path: Path, times):
+    frames = open_recording(path).frames
+    np.testing.assert_array_equal(frames.times, times)
+    np.testing.assert_array_equal(frames.read(1), FRAME[::-1])
+    np.testing.assert_array_equal(frames.read(0), FRAME)
+
+
+def test_hdf5_event_cnn_minimal(tmp_path):
+    path = write_cnn(tmp_path / "a.h5")
+    check(path, size=None)
+    check_frames(path, [0, 100_000])
+    recording = open_recording(path)
+    assert (recording.height, recording.width, recording.count) == (240, 320, 5)
+    check(write_cnn(tmp_path / "us.h5", t=T))  # integers: microseconds
+    check(write_cnn(tmp_path / "no_suffix"))
+    recording = open_recording(write_cnn(tmp_path / "b.h5", size=None, x=X % 4, y=Y % 3))
+    assert (recording.height, recording.width) == (3, 4)  # of the frames
+
+
+def test_hdf5_dsec(tmp_path):
+    hdf5plugin = pytest.importorskip("hdf5plugin")
+    with h5py.File(tmp_path / "events.h5", "w") as file:
+        for name, column, kind in zip("txyp", (T, X, Y, P), "u4 u2 u2 u1".split(), strict=True):
+            packed = {"data": column.astype(kind), "compression": hdf5plugin.Blosc()}
+            file.create_dataset(f"events/{name}", **packed)
+        file["t_offset"] = 5_000_000_000
+    check(tmp_path / "events.h5", t=T + 5_000_000_000)
+    assert open_recording(tmp_path / "events.h5", (240, 320)).count == 5
+
+
+def test_hdf5_without_its_compression(tmp_path, monkeypatch):
+    with h5py.File(tmp_path / "events.h5", "w") as file:
+        for name, column in zip("txyp", (T, X, Y, P), strict=True):
+            file.create_dataset(f"events/{name}", data=column, compression="gzip")
+    check(tmp_path / "events.h5")
+    without(monkeypatch, "hdf5plugin")
+    monkeypatch.setattr(h5py.h5z, "filter_avail", lambda number: False)
+    refused(tmp_path / "events.h5", "hdf5plugin", 'pip install "firenet-jax[formats]"')
+
+
+def test_hdf5_mvsec(tmp_path):
+    path = tmp_path / "indoor.hdf5"
+    with h5py.File(path, "w") as file:
+        seconds = 1.5e9 + T / 1e6
+        file["davis/left/events"] = np.stack([X % 4, Y % 3, seconds, np.where(P, 1, -1)], 1)
+        file["davis/left/image_raw"] = np.stack([FRAME, FRAME[::-1]])
+        file["davis/left/image_raw_ts"] = [1.5e9, 1.5e9 + 0.1]
+    check(path, T + 1_500_000_000_000_000, X % 4, Y % 3, size=None)
+    check_frames(path, [1_500_000_000_000_000, 1_500_000_000_100_000])
+
+
+def test_hdf5_in_chunks(tmp_path, monkeypatch):
+    path = write_cnn(tmp_path / "a.h5")
+    monkeypatch.setattr(readers, "CHUNK", 2)
+    assert [len(chunk) for chunk in open_recording(path).events()] == [2, 2, 1]
+    check(path)
+    path = write_cnn(tmp_path / "b.h5", t=np.array([0.1, 0.2, 0.15, 0.3, 0.4]))
+    refused(path, "event 3: time runs backwards")  # across the boundary of two chunks
+    path = write_cnn(tmp_path / "c.h5", t=np.array([0.1, 0.2, 0.3, np.nan, 0.4]))
+    refused(path, "event 4: the time is nan")
+
+
+def test_wrong_hdf5(tmp_path):
+    path = write_cnn(tmp_path / "a.h5", *(np.resize(column, 9000) for column in (T, X, Y, P)))
+    refused(write(tmp_path / "cut.h5", path.read_bytes()[:-5000]), "cannot be read")
+    refused(write(tmp_path / "text.h5", "hello"), "cannot be read")
+    path = write_cnn(tmp_path / "short.h5", x=X[:-1])
+    refused(path, "its columns differ in length", "/events/xs (4,)")
+    refused(write_cnn(tmp_path / "big.h5", x=X + 40_000), "event 1: x is 40000")
+    refused(write_cnn(tmp_path / "p.h5", p=P * 3), "event 1: the polarity is 3")
+    refused(write_cnn(tmp_path / "minus.h5", y=-Y), "event 1: y is -3, but coordinates are 0 or")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["events/CD"] = X
+    refused(tmp_path / "other.h5", "holds events, events/CD, expected the columns events/xs")
+    with h5py.File(tmp_path / "shape.h5", "w") as file:
+        file["davis/left/events"] = np.zeros((4, 3))
+    refused(tmp_path / "shape.h5", "has the shape (4, 3), expected (N, 4)")
+    with h5py.File(write_cnn(tmp_path / "frames.h5"), "a") as file:
+        del file["images/image000000001"].attrs["timestamp"]
+    refused(tmp_path / "frames.h5", "timestamp")
+    assert not hdf5.matches(tmp_path)
+
+
+# ---------------------------------------------------------------- .npy
+
+
+RESOLUTION = '{"sensor_resolution": [240, 320]}'
+
+
+def write_npy(folder: Path, names, t=T / 1e6, p=P, metadata=RESOLUTION) -> Path:
+    folder.mkdir(exist_ok=True)
+    xy = np.stack([X, Y], 1).astype(np.int16)
+    frames = np.stack([FRAME, FRAME[::-1]])
+    for name, array in zip(names, (t, xy, p, frames, np.array([0, 0.1])), strict=True):
+        np.save(folder / name, array)
+    if metadata:
+        write(folder / "metadata.json", metadata)
+    return folder
+
+
+EVREAL = ("events_ts", "events_xy", "events_p", "images", "images_ts")
+MEMMAP = ("t", "xy", "p", "images", "timestamps")
+
+
+@pytest.mark.parametrize("names", [EVREAL, MEMMAP], ids=["EVREAL", "event_cnn_minimal"])
+def test_npy(tmp_path, names):
+    path = write_npy(tmp_path, names)
+    check(path, size=None)
+    check_frames(path, [0, 100_000])
+    assert open_recording(path).count == 5
+    check(write_npy(tmp_path, names, t=T[:, None], p=P[:, None], metadata=None))
+    (tmp_path / "images.npy").unlink()
+    assert open_recording(path, (240, 320)).frames is None
+
+
+def test_wrong_npy(tmp_path):
+    refused(write_npy(tmp_path / "a", EVREAL, p=P[:-1]), "do not fit together", "p (4,)")
+    refused(write_npy(tmp_path / "b", EVREAL, t=np.append(T[:-1], np.nan)), "event 5: the time is")
+    folder = write_npy(tmp_path / "c", EVREAL, metadata="{")
+    refused(folder, "metadata.json: cannot be read", size=None)
+    folder = write_npy(tmp_path / "d", MEMMAP)
+    write(folder / "t.npy", (folder / "t.npy").read_bytes()[:-8])
+    refused(folder, "t.npy: cannot be read")
+    np.save(folder / "t.npy", np.array([{}], object), allow_pickle=True)
+    refused(folder, "t.npy: cannot be read")
+    np.save(folder / "t.npy", T)
+    np.save(folder / "timestamps.npy", np.array([0.1]))
+    refused(folder, "has 2 frames in images.npy, but 1 times")
+
+
+# ---------------------------------------------------------------- N-Caltech101
+
+
+def bin_event(t: int, x: int, y: int, p: int) -> bytes:
+    return bytes([x, y]) + (p << 23 | t).to_bytes(3, "big")
+
+
+def test_ncaltech(tmp_path, monkeypatch):
+    t = np.array([6, 0x123456, 0x123456, 0x7FFFFF])
+    events = [(6, 131, 2, 1), (0x123456, 0, 9, 0), (0x123456, 233, 179, 1), (0x7FFFFF, 1, 1, 0)]
+    path = write(tmp_path / "a.bin", b"".join(bin_event(*event) for event in events))
+    check(path, t, [131, 0, 233, 1], [2, 9, 179, 1], [1, 0, 1, 0])
+    # Row 240 moves the clock on by 2^13 us.
+    events = [(100, 1, 1, 1), (0, 0, 240, 0), (7, 2, 2, 0), (9, 5, 240, 1), (9, 3, 3, 1)]
+    path = write(tmp_path / "b.bin", b"".join(bin_event(*event) for event in events))
+    for chunk in (1000, 3, 2):
+        monkeypatch.setattr(ncaltech, "CHUNK", chunk)
+        check(path, [100, 8192 + 7, 2 * 8192 + 9], [1, 2, 3], [1, 2, 3], [1, 0, 1])
+    refused(write(tmp_path / "cut.bin", path.read_bytes()[:-1]), "24 bytes", "multiple of 5")
+
+
+# ---------------------------------------------------------------- DAT
+
+
+def test_dat(tmp_path, monkeypatch):
+    header = b"% Data file\n% Version 2\n% Width 320\n% Height 240\n"
+    body = b"".join(struct.pack("<II", t, p << 28 | y << 14 | x) for t, x, y, p in EVENTS)
+    for kind in (0x00, 0x0C):
+        path = write(tmp_path / "a.dat", header + bytes([kind, 8]) + body)
+        check(path, size=None)
+        assert open_recording(path).count == 5
+    old = b"".join(struct.pack("<II", t, p << 17 | y << 9 | x) for t, x, y, p in EVENTS)
+    check(write(tmp_path / "old.dat", header.replace(b"ion 2", b"ion 1") + b"\x0c\x08" + old))
+    # 32 bits of microseconds start again after 71.6 minutes, within a chunk or between two
+    times = [2**32 - 2, 2**32 - 1, 0, 5]
+    body = b"".join(struct.pack("<II", t, 0) for t in times)
+    path = write(tmp_path / "wrap.dat", header + b"\x00\x08" + body)
+    for chunk in (100, 3, 2, 1):
+        monkeypatch.setattr(dat, "CHUNK", chunk)
+        zeros = [0] * 4
+        check(path, [2**32 - 2, 2**32 - 1, 2**32, 2**32 + 5], zeros, zeros, zeros)
+    refused(write(tmp_path / "cut.dat", path.read_bytes()[:-3]), "ends within an event")
+    refused(write(tmp_path / "type.dat", header + b"\x0e\x08" + body), "type 0x0E and 8 bytes")
+    nine = header.replace(b"ion 2", b"ion 9")
+    refused(write(tmp_path / "version.dat", nine + b"\x00\x08"), "version 9")
+    refused(write(tmp_path / "text.dat", "hello"), "no header")
+    refused(write(tmp_path / "header.dat", header), "no header")
+
+
+# ---------------------------------------------------------------- EVT3
+
+
+def high(value):
+    return 0x8000 | value & 0xFFF
+
+
+def low(value):
+    return 0x6000 | value
+
+
+def row(y):
+    return y
+
+
+def single(x, p=0):
+    return 0x2000 | p << 11 | x
+
+
+def base(x, p=0):
+    return 0x3000 | p << 11 | x
+
+
+def decoded(*pieces):
+    state, events = evt3.State(), []
+    for words in pieces:
+        state, columns = evt3.decode(state, np.array(words, np.uint16))
+        events += zip(*(column.tolist() for column in columns), strict=True)
+    return events
+
+
+def test_evt3_words():
+    words = [
+        *(high(2), low(0x100), row(7), single(30, 1), single(31)),
+        *(base(600, 1), 0x4000 | 0b100000000001, 0x5000 | 0b10000010, 0x5000 | 0b1),
+        *(row(8), low(0x101), 0x4000 | 0b10, single(5)),
+    ]
+    t = 2 * 4096 + 0x100
+    expected = [
+        *((t, 30, 7, 1), (t, 31, 7, 0)),
+        *((t, 600, 7, 1), (t, 611, 7, 1), (t, 613, 7, 1), (t, 619, 7, 1), (t, 620, 7, 1)),
+        *((t + 1, 629, 8, 1), (t + 1, 5, 8, 0)),
+    ]
+    assert decoded(words) == expected
+    for cut in range(len(words) + 1):
+        assert decoded(words[:cut], words[cut:]) == expected
+    assert decoded(*([word] for word in words)) == expected
+    assert decoded([]) == []
+
+
+def test_evt3_time():
+    ticks = [high(0xFFE), low(5), row(1), single(1), high(0xFFF), low(6), single(2), low(0xFFF)]
+    ticks += [single(3), high(0), single(4), low(7), single(5), high(1), low(8), single(6)]
+    start = 0xFFE << 12
+    times = [start + 5, start + 4096 + 6, start + 8191, start + 8192, start + 8192 + 7]
+    times += [start + 3 * 4096 + 8]
+    for pieces in [ticks], [[word] for word in ticks], [ticks[:9], ticks[9:10], ticks[10:]]:
+        assert [event[0] for event in decoded(*pieces)] == times
+    # every 16.8 s, many times over
+    long = [w for i in range(3 * 4096) for w in (high(i), low(0), row(0), single(0))]
+    assert [event[0] for event in decoded(long)] == [i << 12 for i in range(3 * 4096)]
+    # a repeated high part changes nothing
+    assert decoded([high(1), low(9), row(0), high(1), single(3)]) == [(4096 + 9, 3, 0, 0)]
+    # nothing is told before the first complete time, row and base
+    words = [row(1), single(1), low(5), single(2), high(1), single(3), low(6), single(4)]
+    assert decoded(words) == [(4096 + 6, 4, 1, 0)]
+    assert decoded([high(1), low(1), single(1), row(1), 0x4001, single(2)]) == [(4097, 2, 1, 0)]
+    # the sensor's small falls are evened out; others stay, to be refused
+    words = [high(50), low(9), row(0), single(0), low(4), single(1), high(49), low(1), single(2)]
+    assert [event[0] for event in decoded(words)] == [(50 << 12) + 9] * 3
+    assert decoded([*words[:4], high(30), low(0)], [single(3)])[-1] == (30 << 12, 3, 0, 0)
+
+
+# ---------------------------------------------------------------- camera files
+
+
+def faery_events(faery, t=T):
+    events = np.zeros(len(t), faery.EVENTS_DTYPE)
+    events["t"], events["x"], events["y"], events["on"] = t, X, Y, P
+    return events
+
+
+@pytest.mark.parametrize("version", ["evt2", "evt3"])
+def test_raw(tmp_path, version):
+    faery = pytest.importorskip("faery")
+    path = tmp_path / "a.raw"
+    faery.events_stream_from_array(faery_events(faery), (320, 240)).to_file(path, version=version)
+    check(path, size=None)
+    assert open_recording(path).format == f"Prophesee raw ({version.upper()})"
+    content = path.read_bytes()
+    refused(write(tmp_path / "cut.raw", content[:-1]), "ends within a word")
+    nameless = content.replace(b"evt ", b"ebt ").replace(b"format", b"fromat")
+    refused(write(tmp_path / "no.raw", nameless), "names no EVT version")
+    # by hand, without faery
+    if version == "evt3":
+        words = [high(1), low(2), row(3), base(4, 1), 0x5003, high(1), single(9)]
+        body = np.array(words, "<u2").tobytes()
+        path = write(tmp_path / "hand.raw", b"% evt 3.0\n% end\n" + body)
+        check(path, [4098] * 3, [4, 5, 9], [3] * 3, [1, 1, 0])
+
+
+@pytest.mark.parametrize(
+    "header, size",
+    [
+        ("% evt 2.0\n", None),
+        ("% format EVT3;height=720;width=1280\n% end\n", (720, 1280)),
+        ("% format EVT21;width=320;height=320\n", (320, 320)),
+        ("% geometry 640x480\n% evt 3.0\n", (480, 640)),
+        ("% Width 304\n% Height 240\n", (240, 304)),
+    ],
+)
+def test_size_in_the_header(header, size):
+    assert dat.header_size(header) == size
+
+
+def test_es_and_aedat4(tmp_path):
+    faery = pytest.importorskip("faery")
+    for name, kind in (("a.es", "Event Stream"), ("a.aedat4", "AEDAT4")):
+        path = tmp_path / name
+        stream = faery.events_stream_from_array(faery_events(faery), (320, 240))
+        stream.to_file(path, **({"zero_t0": False} if name == "a.es" else {}))
+        check(path, size=None)
+        recording = open_recording(path)
+        assert (recording.format, recording.frames) == (kind, None)
+        refused(write(tmp_path / f"other{path.suffix}", b"hello" * 9), "cannot be read")
+    content = path.read_bytes()
+    refused(write(tmp_path / "cut.aedat4", content[:-20]), "cannot be read")
+    path = write(tmp_path / "xml.aedat4", content.replace(b"outInfo", b"out\xffnfo"))
+    refused(path, "header is damaged")  # faery alone would end the process
+
+
+# ---------------------------------------------------------------- ROS bags
+
+HEADER = {1: "Header", 2: "std_msgs/Header"}
+MESSAGES = {
+    "dvs_msgs/msg/Event": "uint16 x\nuint16 y\n{time} ts\nbool polarity\n",
+    "dvs_msgs/msg/EventArray": "{header} header\nuint32 height\nuint32 width\n"
+    "dvs_msgs/Event[] events\n",
+    "event_camera_msgs/msg/EventPacket": "{header} header\nuint32 height\nuint32 width\n"
+    "uint64 seq\nuint64 time_base\nstring encoding\nbool is_bigendian\nuint8[] events\n",
+}
+
+
+class Bag:
+    """Writes messages with rosbags' own encoder."""
+
+    def __init__(self, path: Path, version: int, **options):
+        rosbags = pytest.importorskip("rosbags.typesys")
+        stores = rosbags.Stores
+        store = stores.ROS1_NOETIC if version == 1 else stores.ROS2_HUMBLE
+        self.store, self.version = rosbags.get_typestore(store), version
+        time = "time" if version == 1 else "builtin_interfaces/Time"
+        for name, fields in MESSAGES.items():
+            fields = fields.format(time=time, header=HEADER[1] if version == 1 else HEADER[2])
+            self.store.register(rosbags.get_types_from_msg(fields, name))
+        module = importlib.import_module(f"rosbags.rosbag{version}")
+        if version == 2:
+            options = {"version": 8, **options}
+        self.writer = module.Writer(path, **options)
+        self.writer.open()
+        self.connections = {}
+
+    def type(self, name: str):
+        return self.store.types[name]
+
+    def header(self, microseconds: int):
+        stamp = self.time(microseconds * 1000)
+        seq = {"seq": 0} if self.version == 1 else {}
+        return self.type("std_msgs/msg/Header")(stamp=stamp, frame_id="camera", **seq)
+
+    def time(self, nanoseconds: int):
+        seconds, rest = divmod(int(nanoseconds), 10**9)
+        return self.type("builtin_interfaces/msg/Time")(sec=seconds, nanosec=rest)
+
+    def write(self, topic: str, kind: str, time: int, **fields):
+        if topic not in self.connections:
+            self.connections[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
+        message = self.type(kind)(header=self.header(time), **fields)
+        encode = self.store.serialize_ros1 if self.version == 1 else self.store.serialize_cdr
+        self.writer.write(self.connections[topic], time * 1000 + 900, encode(message, kind))
+
+    def events(self, topic: str, time: int, t, x, y, p):
+        event = self.type("dvs_msgs/msg/Event")
+        events = [
+            event(x=int(a), y=int(b), ts=self.time(1000 * c + 499), polarity=bool(d))
+            for a, b, c, d in zip(x, y, t, p, strict=True)
+        ]
+        self.write(topic, "dvs_msgs/msg/EventArray", time, height=240, width=320, events=events)
+
+    def packet(self, time: int, payload: bytes, encoding="evt3", base=0, topic="/camera/events"):
+        self.write(
+            topic,
+            "event_camera_msgs/msg/EventPacket",
+            time,
+            height=240,
+            width=320,
+            seq=1,
+            time_base=base,
+            encoding=encoding,
+            is_bigendian=False,
+            events=np.frombuffer(payload, np.uint8),
+        )
+
+    def image(self, topic: str, time: int, picture: np.ndarray, encoding="mono8"):
+        padded = np.pad(picture.reshape(len(picture), -1), ((0, 0), (0, 3)))
+        self.write(
+            topic,
+            "sensor_msgs/msg/Image",
+            time,
+            height=picture.shape[0],
+            width=picture.shape[1],
+            encoding=encoding,
+            is_bigendian=0,
+            step=padded.shape[1],
+            data=padded.reshape(-1),
+        )
+
+    def close(self):
+        self.writer.close()
+
+
+@pytest.fixture(params=["ros1", "ros2", "mcap"])
+def new_bag(request, tmp_path):
+    """name -> (path, Bag)"""
+    version = 1 if request.param == "ros1" else 2
+
+    def new(name: str):
+        path = tmp_path / (f"{name}.bag" if version == 1 else name)
+        options = {}
+        if request.param == "mcap":
+            rosbag2 = pytest.importorskip("rosbags.rosbag2")
+            options["storage_plugin"] = rosbag2.StoragePlugin.MCAP
+        return path, Bag(path, version, **options)
+
+    return new
+
+
+EPOCH = 1_600_000_000_000_000  # microseconds
+
+
+def test_bag_of_event_arrays(new_bag):
+    path, bag = new_bag("a")
+    bag.events("/dvs/events", EPOCH, T[:3] + EPOCH, X[:3], Y[:3], P[:3])
+    bag.image("/other/image_raw", EPOCH, FRAME // 2)
+    bag.image("/dvs/image_raw", EPOCH + 7, FRAME)
+    bag.events("/dvs/events", EPOCH + 10, [], [], [], [])
+    bag.events("/dvs/events", EPOCH + 20, T[3:4] + EPOCH, X[3:4], Y[3:4], P[3:4])
+    bag.image("/dvs/image_raw", EPOCH + 30, FRAME[::-1])
+    bag.events("/dvs/events", EPOCH + 40, T[4:] + EPOCH, X[4:], Y[4:], P[4:])
+    bag.close()
+    check(path, t=T + EPOCH, size=None)
+    check_frames(path, [EPOCH + 7, EPOCH + 30])
+    assert open_recording(path).format == ("ROS 1 bag" if bag.version == 1 else "ROS 2 bag")
+
+
+@pytest.mark.parametrize("at_once", [1, 4, 1 << 18])
+def test_bag_of_evt3_packets(new_bag, monkeypatch, at_once):
+    """The state goes on from message to message; the first event is at its message's time."""
+    monkeypatch.setattr(rosbag, "WORDS", at_once)
+    path, bag = new_bag("a")
+    pieces = [
+        [row(9), single(1)],  # before the first time: its place is unknown
+        [high(0xFFF), low(0xFF0), row(3), single(10, 1)],
+        [single(11), base(20, 1), low(0xFFF)],
+        [0x5003],
+        [high(0), low(4), 0x5001],
+    ]
+    for i, words in enumerate(pieces):
+        bag.packet(EPOCH + i, np.array(words, "<u2").tobytes())
+    bag.close()
+    t = np.array([0, 0, 15, 15, 20]) + EPOCH + 1
+    check(path, t, [10, 11, 20, 21, 28], [3] * 5, [1, 0, 1, 1, 1], size=None)
+
+
+def test_bag_of_mono_packets(new_bag, caplog):
+    path, bag = new_bag("a")
+    for start in (0, 3):
+        base, words = EVENTS[start][0], []
+        for t, x, y, p in EVENTS[start : start + 3]:
+            words.append(p << 63 | y << 48 | x << 32 | (t - base) * 1000)
+        bag.packet(EPOCH + start, np.array(words, "<u8").tobytes(), "mono", base * 1000)
+    bag.packet(EPOCH, b"", "mono", topic="/second/events")
+    bag.close()
+    check(path, t=T - T[0] + EPOCH, size=None)
+    assert "/camera/events, /second/events hold events; reading /camera/events" in caplog.text
+
+
+def test_colour_frames_of_bags(new_bag, caplog):
+    path, bag = new_bag("a")
+    bag.events("/dvs/events", EPOCH, T + EPOCH, X, Y, P)
+    colours = np.zeros((3, 4, 3), np.uint8)
+    colours[..., 0] = 200  # red
+    bag.image("/dvs/image", EPOCH, colours, "rgb8")
+    bag.image("/dvs/image", EPOCH + 1, colours[..., ::-1].copy(), "bgr8")
+    bag.close()
+    frames = open_recording(path).frames
+    for i in range(2):
+        np.testing.assert_array_equal(frames.read(i), np.full((3, 4), 60))  # 0.299 * 200
+    path, bag = new_bag("b")
+    bag.events("/dvs/events", EPOCH, T + EPOCH, X, Y, P)
+    bag.image("/dvs/image", EPOCH, FRAME, "bayer_rggb8")
+    bag.close()
+    assert open_recording(path).frames is None
+    assert "bayer_rggb8: no frames" in caplog.text
+
+
+def test_wrong_bags(new_bag, tmp_path):
+    path, bag = new_bag("a")
+    bag.image("/dvs/image_raw", EPOCH, FRAME)
+    bag.close()
+    refused(path, "holds no topic of events", "/dvs/image_raw (sensor_msgs/msg/Image)")
+    path, bag = new_bag("b")
+    bag.packet(EPOCH, b"\0" * 8, "libcaer_cmp")
+    bag.close()
+    refused(path, "encoded as libcaer_cmp, expected evt3 or mono")
+    path, bag = new_bag("c")
+    bag.events("/dvs/events", EPOCH, T[[1, 0]] + EPOCH, X[:2], Y[:2], P[:2])
+    bag.close()
+    refused(path, "event 2: time runs backwards")
+    if path.is_file():
+        refused(write(tmp_path / "cut.bag", path.read_bytes()[:-200]), "cannot be read")
+        refused(write(tmp_path / "text.bag", "hello"), "cannot be read")
+    else:
+        (data,) = (file for file in path.iterdir() if file.suffix != ".yaml")
+        write(data, data.read_bytes()[:100])
+        refused(path, "cannot be read")
+        write(path / "metadata.yaml", "hello")
+        refused(path, "cannot be read")
+
+
+# ---------------------------------------------------------------- real recordings
+
+# file: needs, (height, width), whether the file says it, events, first time, seconds, x, y up to
+SAMPLES = {
+    "ecd_slider_depth": (None, (180, 240), True, 50_000, 3811, 0.170345, 239, 179),
+    "e2vid_slider_depth.zip": (None, (180, 240), True, 50_000, 3811, 0.170345, 239, 179),
+    "ncaltech101_faces_easy_0001.bin": (None, (173, 151), False, 67_445, 6, 0.299358, 150, 172),
+    "ncars.dat": (None, (42, 78), False, 2_009, 0, 0.099952, 77, 41),
+    "dvxplorer_face.aedat4": ("faery", (240, 320), True, 111_954, None, 0.589917, 319, 239),
+    "davis346_frames.aedat4": ("faery", (260, 346), True, 117_667, None, 0.129999, 345, 259),
+    "evt2_sparklers.raw": ("faery", (480, 640), False, 521_252, None, 0.095871, 639, 479),
+    "evt3_driving.raw": ("faery", (720, 1280), False, 219_596, 11_718_656, 0.008811, 1279, 719),
+    "dvs_synthetic_sweep.es": ("faery", (240, 320), True, 473_225, 0, 0.999, 319, 239),
+    "ros1_event_camera_msgs.bag": ("rosbags", (480, 640), True, 343_474, None, 2.078178, 639, 479),
+    "ros2_event_camera_msgs": ("rosbags", (480, 640), True, 343_474, None, 2.078178, 639, 479),
+}
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_sample(recordings, caplog, name):
+    needs, size, says_size, count, start, seconds, x, y = SAMPLES[name]
+    if needs:
+        pytest.importorskip(needs)
+    recording = open_recording(recordings / name)
+    assert (recording.height, recording.width) == size
+    assert ("inferred" in caplog.text) is not says_size
+    assert recording.count in (None, count)
+    for _ in range(2):  # every call starts from the first event
+        events = concatenate(list(recording.events()))
+        assert len(events) == count
+        assert events.t[-1] - events.t[0] == round(seconds * 1e6)
+    assert start in (None, events.t[0])
+    assert (events.x.max(), events.y.max()) == (x, y)
+    assert 0.3 < events.p.mean() < 0.7
+
+
+def test_sample_frames(recordings):
+    frames = open_recording(recordings / "ecd_slider_depth").frames
+    np.testing.assert_array_equal(frames.times, [0, 38_766, 77_531, 116_296, 155_062])
+    assert frames.read(4).shape == (180, 240) and frames.read(4).std() > 30
+    pytest.importorskip("faery")
+    recording = open_recording(recordings / "davis346_frames.aedat4")
+    frames = recording.frames
+    np.testing.assert_array_equal(np.diff(frames.times), [40_000, 40_000])
+    first = next(recording.events()).t[0]
+    assert 0 < frames.times[0] - first < 10_000
+    in_order = [frames.read(i) for i in range(3)]
+    for i in (2, 0, 0, 1):
+        np.testing.assert_array_equal(frames.read(i), in_order[i])
+    assert in_order[0].shape == (260, 346) and (in_order[0] != in_order[1]).any()
+
+
+def test_both_ways_to_the_same_events(recordings):
+    pairs = [("ecd_slider_depth", "e2vid_slider_depth.zip")]
+    if importlib.util.find_spec("rosbags"):
+        pairs.append(("ros1_event_camera_msgs.bag", "ros2_event_camera_msgs"))
+    for pair in pairs:
+        first, second = (events_of(recordings / name, None) for name in pair)
+        for name in "txyp":
+            np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+def test_evt3_against_faery(recordings):
+    """Both read the same events; times differ where the sensor takes back a time it has told.
+
+    It says 0x32b and at once 0x320: faery stays at the later one for the 1,455 events of 11 us.
+    """
+    pytest.importorskip("faery")
+    theirs = events_of(recordings / "evt3_driving.raw", (720, 1280))
+    content = (recordings / "evt3_driving.raw").read_bytes()
+    with open(recordings / "evt3_driving.raw", "rb") as file:
+        dat.read_header(file)
+        words = np.frombuffer(content[file.tell() :], "<u2")
+    states, columns = evt3.State(), []
+    for piece in np.array_split(words, 37):
+        states, events = evt3.decode(states, piece)
+        columns.append(events)
+    t, x, y, p = map(np.concatenate, zip(*columns, strict=True))
+    np.testing.assert_array_equal(x, theirs.x)
+    np.testing.assert_array_equal(y, theirs.y)
+    np.testing.assert_array_equal(p, theirs.p)
+    later = theirs.t - t
+    assert (later != 0).sum() == 1455 and later.min() == 0 and later.max() == 11
+    assert np.diff(t).min() >= 0
+
+
+def test_damaged_samples(recordings, tmp_path):
+    for name in ("davis346_frames.aedat4", "ros1_event_camera_msgs.bag", "e2vid_slider_depth.zip"):
+        content = (recordings / name).read_bytes()
+        path = write(tmp_path / name, content[: len(content) // 2])
+        refused(path, "cannot be read", size=(480, 640))
