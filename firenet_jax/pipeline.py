@@ -12,8 +12,9 @@ import itertools
 import json
 import os
 import time
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -82,8 +83,8 @@ class Reconstruct:
     """Pictures per second of a video (windows of events have no rate of their own)."""
     sensor_size: str | None = None
     """WIDTHxHEIGHT of the sensor, such as 240x180, where the recording does not say it."""
-    chunk: int = 8
-    """Windows a recording gives the device at once."""
+    chunk: int | None = None
+    """Windows a recording gives the device at once (default: 4 on a CPU, 16 elsewhere)."""
     batch: int = 1
     """Recordings that run side by side on the device."""
     overwrite: bool = False
@@ -91,8 +92,9 @@ class Reconstruct:
 
     def __post_init__(self):
         for name in ("chunk", "batch", "fps"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}, but must be more than 0")
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} is {value}, but must be more than 0")
         if self.network.pad < 1:
             raise ValueError(f"pad is {self.network.pad}, but pads to a multiple of 1 or more")
         if self.display.unsharp < 0:
@@ -120,7 +122,6 @@ class Running:
     ahead: Window | None  # the next window; None after the last
     done: int  # pictures of an earlier run, already on disk
     writer: FolderWriter | VideoWriter | None = None  # opened with the first picture
-    saved: float = field(default_factory=time.monotonic)
 
     def take(self, count: int) -> list[Window]:
         """The next `count` windows, or as many as there are."""
@@ -212,10 +213,17 @@ def reconstruct_jobs(
     height, width = jobs[0].recording.height, jobs[0].recording.width
     slots = min(settings.batch, len(jobs))
     weights = jax.device_put(weights)
-    chunks = ahead(in_chunks(jobs, settings, slots))
+    chunks = ahead(in_chunks(jobs, settings, slots), depth=1)
 
     def device():
-        session = initial_session(slots, height, width, settings.network)
+        """Chunk by chunk: (chunk, pictures on the host, states to keep for resuming, by slot).
+
+        An accelerator has the next chunk before the last one's pictures are fetched, so that it
+        never waits. A CPU has not: it would gain nothing, and each chunk in flight holds memory.
+        """
+        session, sent = initial_session(slots, height, width, settings.network), deque()
+        in_flight = 1 if jax.default_backend() == "cpu" else 2
+        saved = time.monotonic()
         for chunk in chunks:
             for slot, start in chunk.starts.items():
                 session = _set_slot(session, slot, start)
@@ -223,14 +231,23 @@ def reconstruct_jobs(
                 weights, session, chunk.events, chunk.valid, height=height, width=width,
                 network=settings.network, settings=settings.display, preview=settings.preview,
             )  # fmt: skip
-            yield chunk, session, shown
+            states = {}
+            if time.monotonic() - saved > RESUME_EVERY:
+                states = {slot: _get_slot(session, slot) for slot in chunk.parts}
+                saved = time.monotonic()
+            sent.append((chunk, shown, states))
+            if len(sent) == in_flight:
+                yield fetch(*sent.popleft())
+        yield from (fetch(*entry) for entry in sent)
+
+    def fetch(chunk, shown, states):
+        return chunk, *jax.device_get((shown, states))
 
     pictures_done = events_done = 0
     writing: dict[int, Running] = {}
     finished = ahead(device(), depth=1)
     try:
-        for chunk, session, shown in finished:
-            shown = np.asarray(shown)  # waits for the device, which is then one chunk ahead
+        for chunk, shown, states in finished:
             for slot, (running, times, ends) in chunk.parts.items():
                 if running.writer is None:
                     running.writer = open_writer(running.job.output, settings.fps, running.done)
@@ -243,8 +260,8 @@ def reconstruct_jobs(
                     if isinstance(running.writer, FolderWriter):
                         position_file(running.job).unlink(missing_ok=True)
                     running.writer.finish()
-                elif time.monotonic() - running.saved > RESUME_EVERY:
-                    save_position(running, _get_slot(session, slot))
+                elif slot in states and isinstance(running.writer, FolderWriter):
+                    save_position(running, states[slot])
             events_done += chunk.count
             progress.update(chunk.count)
             progress.set_postfix_str(f"{pictures_done} pictures", refresh=False)
@@ -267,6 +284,7 @@ def _get_slot(session: Session, slot) -> Session:
 
 def in_chunks(jobs: list[Job], settings: Reconstruct, slots: int) -> Iterator[Chunk]:
     """Jobs -> chunks of T x B windows; a free slot takes the next job."""
+    steps = settings.chunk or (4 if jax.default_backend() == "cpu" else 16)
     waiting = iter(jobs)
     running: dict[int, Running] = {}
     size = 0
@@ -278,11 +296,11 @@ def in_chunks(jobs: list[Job], settings: Reconstruct, slots: int) -> Iterator[Ch
                 running[slot], starts[slot] = start(job, settings)
         if not running:
             return
-        rows = [[Events.empty()] * slots for _ in range(settings.chunk)]
-        valid = np.zeros((settings.chunk, slots), bool)
+        rows = [[Events.empty()] * slots for _ in range(steps)]
+        valid = np.zeros((steps, slots), bool)
         parts = {}
         for slot, job in list(running.items()):
-            windows = job.take(settings.chunk)
+            windows = job.take(steps)
             for t, window in enumerate(windows):
                 rows[t][slot] = window.events
             valid[: len(windows), slot] = True
@@ -345,14 +363,11 @@ def position_file(job: Job) -> Path:
 
 
 def save_position(running: Running, session: Session) -> None:
-    """Keeps beside the partial output what is needed to go on from here; only folders can."""
-    running.saved = time.monotonic()
-    if not isinstance(running.writer, FolderWriter):
-        return
+    """Keeps beside the partial output what is needed to go on from here."""
     running.writer.flush()
     path = position_file(running.job)
     beside = path.with_suffix(".new.npz")
-    leaves = {f"state{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(session))}
+    leaves = {f"state{i}": leaf for i, leaf in enumerate(jax.tree.leaves(session))}
     np.savez(beside, record=running.job.record, pictures=running.writer.count, **leaves)
     os.replace(beside, path)
 

@@ -34,7 +34,7 @@ from firenet_jax.events import (
 # In the order in which they are asked.
 FORMATS = ("ecd", "npy", "rosbag", "hdf5", "text", "ncaltech", "dat", "camera")
 
-CHUNK = 1 << 20  # events a reader yields at once: 13 MB as Events
+CHUNK = 1 << 18  # events a reader yields at once: 3 MB as Events
 
 
 @dataclass(frozen=True)

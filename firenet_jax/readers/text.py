@@ -8,7 +8,7 @@ point they are microseconds, and a notice says so. A line of names (`x,y,p,t`, a
 columns are skipped) sets the order of the columns; Metavision's `%geometry:1280,720` sets the size
 and that program's own order. Lines are counted from 1, header included; empty lines do not matter.
 
-Blocks of 8 MB go through pyarrow's parser, at 9 million events/s on two cores; only a block
+Blocks of 2 MB go through pyarrow's parser, at 9 million events/s on two cores; only a block
 that it refuses is read again in Python, to name the line.
 """
 
@@ -28,7 +28,7 @@ import pyarrow.csv
 from firenet_jax.events import Events, RecordingError, logger
 from firenet_jax.readers import REACH, Source, reading, to_events
 
-BLOCK = 1 << 23  # bytes parsed at once: about 350,000 events
+BLOCK = 1 << 21  # bytes parsed at once: about 90,000 events
 HEAD = 1 << 16  # bytes from which the layout is told
 SNIFFED = 1000  # rows from which the units are told
 
