@@ -147,9 +147,7 @@ class Chunk(NamedTuple):
     count: int  # events
     valid: np.ndarray  # (T, B) bool
     parts: dict[int, Part]  # by slot
-    starts: dict[
-        int, Session
-    ]  # slots that take a new recording here, and the state they start from
+    starts: dict[int, Session]  # by slot: a new recording begins here, from this state
 
 
 def run(settings: Reconstruct) -> list[Path]:
@@ -256,10 +254,10 @@ def reconstruct_jobs(
                     running.writer.write(picture, time_of)
                 pictures_done += len(times)
                 if ends:
-                    del writing[slot]
                     if isinstance(running.writer, FolderWriter):
                         position_file(running.job).unlink(missing_ok=True)
                     running.writer.finish()
+                    del writing[slot]
                 elif slot in states and isinstance(running.writer, FolderWriter):
                     save_position(running, states[slot])
             events_done += chunk.count
