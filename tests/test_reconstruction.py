@@ -5,6 +5,7 @@ import pytest
 from test_network import random_run
 from test_tensors import random_events
 
+from firenet_jax.checkpoint import convert
 from firenet_jax.events import Events
 from firenet_jax.network import Weights, initial_params, initial_state
 from firenet_jax.pictures import Display
@@ -19,9 +20,13 @@ from firenet_jax.tensors import pack
 
 
 @pytest.mark.parametrize("chunk", [1, 3, 7])
-def test_streamed_in_chunks_equals_one_scan(chunk):
-    params, tensors = random_run(steps=15, batch=1)
-    weights = Weights(params, True)
+@pytest.mark.parametrize("published", [False, pytest.param(True, marks=pytest.mark.reference)])
+def test_streamed_in_chunks_equals_one_scan(chunk, published, request):
+    """With weights whose images are about 1, as the bound of 1e-6 supposes."""
+    _, tensors = random_run(steps=15, batch=1)
+    weights = Weights(initial_params(jax.random.key(0)), True)
+    if published:
+        weights = convert(request.getfixturevalue("reference") / "firenet_published.pth")
     final, expected = reconstruct(weights, initial_state(1, 23, 31), tensors)
     state, images = initial_state(1, 23, 31), []
     for start in range(0, 15, chunk):
@@ -32,8 +37,8 @@ def test_streamed_in_chunks_equals_one_scan(chunk):
 
 
 def test_batched_with_longer_and_shorter_ones_equals_alone():
-    params, tensors = random_run(steps=9, batch=3)
-    weights, lengths = Weights(params, True), (4, 9, 0)
+    _, tensors = random_run(steps=9, batch=3)
+    weights, lengths = Weights(initial_params(jax.random.key(0)), True), (4, 9, 0)
     valid = jnp.arange(9)[:, None] < jnp.array([lengths])
     state, images = reconstruct(weights, initial_state(3, 23, 31), tensors, valid)
     for b, length in enumerate(lengths):
