@@ -1,4 +1,4 @@
-"""Command line -> one command: firenet reconstruct | info | convert.
+"""Command line -> one command: firenet demo | reconstruct | info | simulate | train | convert.
 
 A command is a frozen dataclass of settings and a `run(settings)` beside it, in a module that is
 imported only when the command is named: `firenet --help` loads no jax.
@@ -14,8 +14,11 @@ import sys
 
 # name: (module, settings, what it does)
 COMMANDS = {
+    "demo": ("firenet_jax.demo", "Demo", "a simulated scene -> events | reconstruction | truth"),
     "reconstruct": ("firenet_jax.pipeline", "Reconstruct", "recordings -> video or pictures"),
     "info": ("firenet_jax.info", "Info", "what a recording holds"),
+    "simulate": ("firenet_jax.dataset", "Simulate", "training data, or a video file -> events"),
+    "train": ("firenet_jax.train", "Train", "simulated sequences -> weights"),
     "convert": ("firenet_jax.checkpoint", "Convert", "PyTorch checkpoint -> weights.npz"),
 }
 
@@ -75,7 +78,10 @@ def main(arguments: list[str] | None = None) -> int:
         )
         command.run(parsed)
     except KeyboardInterrupt:
-        print("firenet: interrupted; a folder of pictures goes on when run again", file=sys.stderr)
+        print(
+            "firenet: interrupted; a folder of pictures or sequences goes on when run again",
+            file=sys.stderr,
+        )
         return 130
     except (ValueError, OSError) as error:
         if os.environ.get("FIRENET_DEBUG"):

@@ -1,4 +1,4 @@
-"""Slow, obvious versions of the perceptual distances: numpy and scipy in float64, one image at a time.
+"""Slow, obvious versions of the perceptual distances: numpy, scipy, float64, one image at a time.
 
 Written from the formulas alone, without the package's code. SSIM is scikit-image's.
 """
@@ -185,7 +185,7 @@ def random_features(kernels, image, truth):
         picture = (picture - 0.45) / 0.225
         height, width = (side // 2 * 2 for side in picture.shape)
         channels = [picture[y:height:2, x:width:2] for y in (0, 1) for x in (0, 1)]
-        for layer, kernel in enumerate(np.asarray(kernels[k], np.float64) for k in range(3)):
+        for layer, kernel in enumerate(kernels):
             if layer:
                 channels = [halved(channel) for channel in channels]
             outputs = []

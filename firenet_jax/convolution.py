@@ -1,0 +1,68 @@
+"""Image, kernel -> image: the convolution of all layers, whose gradient is quick on a CPU too.
+
+Images are (B, H, W, channels), kernels (rows, columns, inputs, outputs), odd sizes, zero padding,
+no striding. Forward and the gradient with respect to the image are XLA's convolutions everywhere.
+The gradient with respect to the kernel is XLA's on accelerators; on a CPU, inside a scan, XLA
+computes it with a loop of scalars that takes 14 times as long as the matrix products below.
+"""
+
+import jax
+import jax.numpy as jnp
+
+DIMENSIONS = ("NHWC", "HWIO", "NHWC")
+
+
+def _convolve(image: jax.Array, kernel: jax.Array) -> jax.Array:
+    return jax.lax.conv_general_dilated(image, kernel, (1, 1), "SAME", dimension_numbers=DIMENSIONS)
+
+
+@jax.custom_vjp
+def convolve(image: jax.Array, kernel: jax.Array) -> jax.Array:
+    """(B, H, W, I), (rows, columns, I, O) -> (B, H, W, O); gradients in reverse mode only."""
+    return _convolve(image, kernel)
+
+
+def _forward(image, kernel):
+    return _convolve(image, kernel), (image, kernel)
+
+
+def _backward(kept, gradient):
+    image, kernel = kept
+    flipped = kernel[::-1, ::-1].swapaxes(2, 3)
+    by_kernel = jax.lax.platform_dependent(
+        image, kernel, gradient, cpu=kernel_gradient, default=_xla_kernel_gradient
+    )
+    return _convolve(gradient, flipped), by_kernel
+
+
+convolve.defvjp(_forward, _backward)
+
+
+def _xla_kernel_gradient(image, kernel, gradient):
+    return jax.vjp(lambda kernel: _convolve(image, kernel), kernel)[1](gradient)[0]
+
+
+def kernel_gradient(image: jax.Array, kernel: jax.Array, gradient: jax.Array) -> jax.Array:
+    """dK[i, j] = sum over all pixels of image[y + i - r, x + j - c] gradient[y, x]^T.
+
+    A matrix product for each row i of the kernel: the image shifted by i rows, times the
+    gradient shifted against the columns j of the kernel, these side by side as channels.
+    """
+    rows, columns, inputs, outputs = kernel.shape
+    height, width = image.shape[1:3]
+    r, c = rows // 2, columns // 2
+    image = jnp.pad(image, ((0, 0), (r, r), (0, 0), (0, 0)))
+    gradient = jnp.pad(gradient, ((0, 0), (0, 0), (c, c), (0, 0)))
+    shifted = [gradient[:, :, columns - 1 - j :][:, :, :width] for j in range(columns)]
+    beside = jnp.concatenate(shifted, -1)  # (B, H, W, columns O)
+    products = [
+        jnp.einsum(
+            "byxi,byxo->io",
+            image[:, i : i + height],
+            beside,
+            preferred_element_type=jnp.float32,  # a sum over all pixels: too long for bfloat16
+        )
+        for i in range(rows)
+    ]
+    products = jnp.stack(products).reshape(rows, inputs, columns, outputs)
+    return products.swapaxes(1, 2).astype(kernel.dtype)

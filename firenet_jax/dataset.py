@@ -1,0 +1,522 @@
+"""Scenes before sensors, or a video file -> HDF5 training sets, one sequence a file.
+
+The layout is that of event_cnn_minimal (Stoffregen et al. 2020), which many programs read:
+
+    events/{xs, ys, ts, ps}   int16, int16, float64 seconds, bool; compressed
+    images/image%09d          (H, W) uint8; attributes timestamp, event_idx, size
+    flow/flow%09d             (2, H, W) float32, x then y, pixels per second on that image's grid;
+                              attributes timestamp, size
+    attributes                sensor_resolution (H, W), num_events, num_pos, num_neg, t0, tk,
+                              duration, num_imgs, num_flow, source, and settings (JSON)
+
+Flow i is the exact displacement from one picture period before image i to image i, divided by that
+period: times the period, what was at x - d(x) in the last image is at x now (backward warping).
+A file appears under its name when it is whole, so a run that was interrupted goes on where it was.
+"""
+
+import dataclasses
+import importlib.metadata
+import json
+import math
+import shutil
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import av
+import h5py
+import jax
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from firenet_jax.events import Events, concatenate, parse_size
+from firenet_jax.overlap import ahead
+from firenet_jax.scenes import (
+    Scene,
+    SceneSettings,
+    flow,
+    load_textures,
+    random_scene,
+    rendering_times,
+    video,
+)
+from firenet_jax.sensor import FAULTY, LONGEST, SensorSettings, event_list, random_sensor
+from firenet_jax.video import OutputError, partial_name
+
+ROWS = 1 << 16  # events in a chunk of the file, and so many are written at once
+GZIP = 4  # for 50 % more time than level 1: events take 10 % less room, flow 25 %
+FLOW_BITS = 11  # of the fastest pixel's flow, see `rounded_flow`
+POOL = 32  # sequences that choose from the same textures, and how many these are
+TEXTURES, TEXTURE_SIZE = 64, 320
+FEW = 8  # sequences after which their mean size is that of all, more or less
+LONGEST_SCENE = 60.0  # seconds; a scene's clock is float32, which by then ticks in 4 us
+CLIP_SUFFIXES = (".h5", ".hdf5")
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Make training data: random scenes before a simulated event camera, or a video turned into
+    events, as HDF5 files with events, pictures and optical flow.
+
+    Examples:
+      firenet simulate -o data/                                   (the paper's set: 950 and 50)
+      firenet simulate -o data/ --images coco/train2017 --sequences 1000 --seconds 2
+      firenet simulate -o data/ --sequences 40 --faults
+      firenet simulate -o events.h5 --video clip.mp4
+    """
+
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """A folder, in which train/ and validation/ are made; with --video a name that ends in .h5."""
+    sequences: int = 1000
+    """Sequences, those for validation included. A run with more goes on where the last ended."""
+    validation: int | None = None
+    """So many of them are for validation; one in twenty where nothing is said, as in the paper."""
+    seconds: float = 2.0
+    """How long each sequence lasts."""
+    fps: float = 50.0
+    """Pictures per second, each with its optical flow."""
+    sensor_size: str | None = None
+    """WIDTHxHEIGHT; 240x180 where nothing is said, and a video's own size."""
+    images: Path | None = None
+    """Folder of pictures for the textures (the paper took MS-COCO). Without it: photographs that
+    come with scikit-image, where it is installed, and drawn textures."""
+    seed: int = 0
+    """Other numbers give other sequences; the same number gives the same again."""
+    video: Path | None = None
+    """Turn this video file into events instead; between its pictures the log intensity changes
+    linearly, and there is no optical flow."""
+    faults: bool = False
+    """What real sensors have: mismatch, noise, leak, hot pixels, finite bandwidth; options below
+    that are given stay as given."""
+    overwrite: bool = False
+    """With --video: replace an output that exists."""
+    scene: SceneSettings = SceneSettings()
+    sensor: SensorSettings = SensorSettings()
+
+    def __post_init__(self):
+        if not 0 < self.seconds <= LONGEST_SCENE:
+            raise ValueError(
+                f"seconds is {self.seconds}, but a sequence lasts more than 0 and up to "
+                f"{LONGEST_SCENE:g}: make more sequences instead"
+            )
+        if not 0 < self.fps <= 1e5:
+            raise ValueError(f"fps is {self.fps}, but must be more than 0 and up to 100000")
+        if self.sequences < 1:
+            raise ValueError(f"sequences is {self.sequences}, but must be 1 or more")
+        if self.validation is not None and not 0 <= self.validation <= self.sequences:
+            raise ValueError(
+                f"validation is {self.validation}, but must be between 0 and the number of "
+                f"sequences, {self.sequences}"
+            )
+        parse_size(self.sensor_size)
+
+
+class Picture(NamedTuple):
+    """What a camera beside the events sees."""
+
+    time: int  # microseconds
+    image: np.ndarray  # (H, W) uint8
+    flow: np.ndarray | None  # (2, H, W) float32, pixels per second, x then y
+
+
+# ---- Files
+
+
+def write_sequence(
+    path: Path,
+    events: Iterable[Events],
+    pictures: Iterable[Picture],
+    *,
+    height: int,
+    width: int,
+    source: str = "unknown",
+    settings: dict | None = None,
+) -> int:
+    """Time-ordered events and pictures -> one file; returns the number of events.
+
+    Memory does not grow with either. source: a name of the layout's list ("esim", "unknown").
+    settings: what the file was made from, kept in it as JSON.
+    Raises OutputError where it cannot be written. What else goes wrong goes through, but leaves
+    nothing under the final name, nor beside it.
+    """
+    beside = partial_name(path)
+    try:
+        with _writing(path), h5py.File(beside, "w") as file:
+            times, flows = _write_pictures(file, pictures, height, width)
+            count, facts = _write_events(file, events, times)
+            file.attrs.update(
+                sensor_resolution=np.array([height, width], np.int64),
+                num_imgs=len(times),
+                num_flow=flows,
+                source=source,
+                settings=json.dumps(settings or {}),
+                **facts,
+            )
+        with _writing(path):
+            beside.replace(path)
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise
+    finally:
+        for stream in (events, pictures):
+            getattr(stream, "close", bool)()  # of generators: ends their threads, closes files
+    return count
+
+
+class _writing:
+    """h5py's errors of writing, as one sentence. Those of the streams are not OSErrors."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, error, trace):
+        if isinstance(error, OSError):
+            raise OutputError(
+                f"{self.path}: cannot write ({error.strerror or error}): nothing is under this "
+                "name; make room or choose another output"
+            ) from error
+
+
+def _write_pictures(file, pictures: Iterable[Picture], height, width) -> tuple[np.ndarray, int]:
+    """Returns the pictures' times (n,) int64, and how many of them have flow."""
+    times, flows = [], 0
+    images = file.create_group("images")
+    packed = {"compression": "gzip", "compression_opts": GZIP, "shuffle": True}
+    for number, picture in enumerate(pictures):
+        size = picture.image.shape
+        if size != (height, width):
+            raise ValueError(f"picture {number} is {size}, expected {(height, width)}")
+        image = images.create_dataset(
+            f"image{number:09d}", data=picture.image, chunks=size, **packed
+        )
+        image.attrs.update(timestamp=1e-6 * picture.time, size=size, type="greyscale")
+        times.append(picture.time)
+        if picture.flow is not None:
+            flow = file.require_group("flow").create_dataset(
+                f"flow{number:09d}", data=picture.flow, chunks=picture.flow.shape, **packed
+            )
+            flow.attrs.update(timestamp=1e-6 * picture.time, size=picture.flow.shape)
+            flows += 1
+    return np.array(times, np.int64), flows
+
+
+def _write_events(file, events: Iterable[Events], times: np.ndarray) -> tuple[int, dict]:
+    """Returns how many there are, and the file's attributes about them.
+
+    An image's event_idx is the number of events before its time: the first that is not earlier.
+    """
+    columns = {
+        name: file.create_dataset(
+            f"events/{name}", (0,), dtype, maxshape=(None,), chunks=(ROWS,),
+            compression="gzip", compression_opts=GZIP, shuffle=True,
+        )
+        for name, dtype in (("xs", np.int16), ("ys", np.int16), ("ts", np.float64), ("ps", bool))
+    }  # fmt: skip
+    count = on = 0
+    first = last = None
+    before = np.zeros(len(times), np.int64)
+    for part in _gathered(events):
+        rows = slice(count, count + len(part))
+        values = {"xs": part.x, "ys": part.y, "ts": part.t / 1e6, "ps": part.p}
+        for name, column in columns.items():
+            column.resize((rows.stop,))
+            column[rows] = values[name]
+        before += np.searchsorted(part.t, times)
+        count, on = rows.stop, on + int(part.p.sum())
+        first, last = int(part.t[0]) if first is None else first, int(part.t[-1])
+    for image, index in zip(file["images"].values(), before, strict=True):
+        image.attrs["event_idx"] = index
+    start, end = 1e-6 * (first or 0), 1e-6 * (last or 0)
+    facts = {"num_events": count, "num_pos": on, "num_neg": count - on}
+    return count, facts | {"t0": start, "tk": end, "duration": end - start}
+
+
+def _gathered(chunks: Iterable[Events]) -> Iterator[Events]:
+    """The same events in chunks of ROWS, so that each is compressed once; the last is shorter."""
+    waiting, count = [], 0
+    for chunk in chunks:
+        waiting.append(chunk)
+        count += len(chunk)
+        if count >= ROWS:
+            whole = concatenate(waiting)
+            full = count - count % ROWS
+            for start in range(0, full, ROWS):
+                yield whole.select(slice(start, start + ROWS))
+            waiting, count = [whole.select(slice(full, None))], count - full
+    if count:
+        yield concatenate(waiting)
+
+
+# ---- Sequences
+
+
+def run(settings: Simulate) -> list[Path]:
+    """Does what the settings say; returns the files, those of an earlier run included. Raises
+    OutputError or ValueError with a message of one sentence."""
+    if settings.video is not None:
+        return [simulate_clip(settings)]
+    height, width = parse_size(settings.sensor_size or "240x180")
+    open_folder(settings)
+    sensor = with_faults(settings.sensor) if settings.faults else settings.sensor
+    record = describe(settings)
+    held_out = settings.sequences // 20 if settings.validation is None else settings.validation
+    split = {"train": settings.sequences - held_out, "validation": held_out}
+    work = [
+        (settings.output / name / f"{number:06d}.h5", part, number)
+        for part, (name, count) in enumerate(split.items())
+        for number in range(count)
+    ]
+    missing = [entry for entry in work if not entry[0].exists()]
+    events = used = 0
+    with tqdm(
+        total=len(work), initial=len(work) - len(missing), unit="seq", smoothing=0.05, disable=None
+    ) as progress:
+        for done, (path, part, number) in enumerate(missing):
+            if done:
+                # The first few sequences say little about the size of all.
+                rest = len(missing) - done
+                _check_room(
+                    settings.output, used / done * (rest if done >= FEW else min(rest, FEW))
+                )
+            key = jax.random.key(settings.seed)
+            for fold in (part, number):
+                key = jax.random.fold_in(key, fold)
+            textures = _textures(settings.images, settings.seed, part, number // POOL)
+            events += write_sequence(
+                path,
+                *sequence(key, textures, settings, sensor, height, width),
+                height=height,
+                width=width,
+                source="esim",
+                settings=record | {"part": path.parent.name, "number": number},
+            )
+            used += path.stat().st_size
+            progress.update()
+            mean = used / (done + 1)
+            progress.set_postfix_str(
+                f"{mean / 1e6:.1f} MB each, {mean * len(work) / 1e9:.1f} GB in all", refresh=False
+            )
+    print(
+        f"{settings.output}: {split['train']} sequences for training and {split['validation']} "
+        f"for validation, {settings.seconds:g} s each at {width}x{height}; {len(missing)} are new: "
+        f"{events:,} events, {used / 1e9:.2f} GB"
+    )
+    return [path for path, *_ in work]
+
+
+@lru_cache(maxsize=1)
+def _textures(images: Path | None, seed: int, part: int, pool: int) -> jax.Array:
+    """What sequences of one pool choose their textures from, (TEXTURES, S, S)."""
+    seed = int(np.random.SeedSequence([seed, part, pool]).generate_state(1)[0])
+    return jax.numpy.asarray(load_textures(images, TEXTURES, TEXTURE_SIZE, seed))
+
+
+def sequence(
+    key: jax.Array,
+    textures: jax.Array,
+    settings: Simulate,
+    sensor: SensorSettings,
+    height: int,
+    width: int,
+) -> tuple[Iterator[Events], Iterator[Picture]]:
+    """One random scene before one random sensor: its events, and its pictures with flow."""
+    scene_key, sensor_key = jax.random.split(key)
+    size = {"height": height, "width": width}
+    scene = random_scene(
+        scene_key, textures, duration=settings.seconds, settings=settings.scene, **size
+    )
+    camera = random_sensor(sensor_key, settings=sensor, **size)
+    count = math.floor(settings.seconds * settings.fps + 1e-6) + 1
+    times = np.round(np.arange(count) * 1e6 / settings.fps).astype(np.int64)
+    times = times[times <= round(1e6 * settings.seconds)]
+    bounds = np.append(times, round(1e6 * settings.seconds))
+    renderings = video(scene, rendering_times(scene, bounds, **size), **size)
+    events = ahead(event_list(camera, renderings), depth=64)
+    return events, ahead(_pictures(scene, times, settings.fps, height, width), depth=4)
+
+
+def _pictures(scene: Scene, times: np.ndarray, fps: float, height, width) -> Iterator[Picture]:
+    size = {"height": height, "width": width}
+    for time, image in video(scene, times, **size):
+        displacement, _ = flow(scene, 1e-6 * time - 1 / fps, 1e-6 * time, **size)
+        velocity = np.moveaxis(np.asarray(displacement) * np.float32(fps), -1, 0)
+        grey = np.round(np.clip(255 * np.asarray(image), 0, 255)).astype(np.uint8)
+        yield Picture(time, grey, rounded_flow(velocity))
+
+
+def rounded_flow(velocity: np.ndarray) -> np.ndarray:
+    """Rounds to 1/2048 of the fastest pixel's flow (up to a power of two), still float32.
+
+    The last bits of a float are noise, which does not compress: rounded flow takes a quarter of
+    the room. 10 pixels of motion then are wrong by at most 0.004.
+    """
+    peak = float(np.abs(velocity).max())
+    if not 0 < peak < np.inf:
+        return np.asarray(velocity, np.float32)
+    step = 2.0 ** (math.ceil(math.log2(peak)) - FLOW_BITS)
+    # + 0.0 turns -0 into 0, which compresses better
+    return (np.round(velocity / np.float32(step)) * np.float32(step) + 0.0).astype(np.float32)
+
+
+def with_faults(sensor: SensorSettings) -> SensorSettings:
+    """FAULTY, except where these settings differ from the plain ones."""
+    plain = SensorSettings()
+    chosen = {
+        field.name: getattr(sensor, field.name)
+        for field in dataclasses.fields(sensor)
+        if getattr(sensor, field.name) != getattr(plain, field.name)
+    }
+    return dataclasses.replace(FAULTY, **chosen)
+
+
+# ---- Folders
+
+
+def describe(settings: Simulate) -> dict:
+    """All that a sequence depends on, apart from its number; ready for JSON."""
+    choices = dataclasses.asdict(settings)
+    for name in ("output", "sequences", "validation", "video", "overwrite"):
+        del choices[name]
+    choices["images"] = None if settings.images is None else str(settings.images.resolve())
+    choices["sensor_size"] = settings.sensor_size or "240x180"
+    choices["version"] = importlib.metadata.version("firenet-jax")
+    return json.loads(json.dumps(choices))
+
+
+def open_folder(settings: Simulate) -> None:
+    """Makes the output folder, or finds that it is one to go on with; else raises OutputError."""
+    folder, record = settings.output, describe(settings)
+    kept = folder / "settings.json"
+    if folder.is_file() or folder.suffix in CLIP_SUFFIXES:
+        raise OutputError(f"{folder}: sequences go into a folder: choose another name")
+    if kept.is_file():
+        try:
+            found = json.loads(kept.read_text())
+        except (OSError, ValueError) as error:
+            raise OutputError(f"{kept} is damaged ({error}): choose another output") from error
+        other = sorted(name for name in {*found, *record} if found.get(name) != record.get(name))
+        if other and not next(folder.glob("*/??????.h5"), None):
+            kept.unlink()  # an earlier run wrote nothing else
+        elif other:
+            pairs = ", ".join(
+                f"{name} was {found.get(name)!r}, now {record.get(name)!r}" for name in other
+            )
+            raise OutputError(
+                f"{folder} holds sequences of other settings ({pairs}): choose another output, or "
+                "go on with the same settings"
+            )
+    elif folder.is_dir() and any(folder.iterdir()):
+        raise OutputError(
+            f"{folder} is not empty, and holds no settings.json of an earlier run: choose another "
+            "output"
+        )
+    try:
+        for name in ("train", "validation"):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+            for left in (folder / name).glob("*.partial.h5"):  # of a run that was killed
+                left.unlink()
+        if not kept.is_file():
+            beside = partial_name(kept)
+            beside.write_text(json.dumps(record, indent=1) + "\n")
+            beside.replace(kept)
+    except OSError as error:
+        raise OutputError(
+            f"{folder}: cannot write there ({error.strerror or error}): choose another output"
+        ) from error
+
+
+def _check_room(folder: Path, needed: float) -> None:
+    """Raises OutputError if so many bytes do not fit on the disk."""
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        raise OutputError(
+            f"{folder}: the rest needs about {needed / 1e9:.1f} GB, but only {free / 1e9:.1f} GB "
+            "are free: make room or ask for fewer --sequences; a further run goes on from here"
+        )
+
+
+# ---- Video files
+
+
+def simulate_clip(settings: Simulate) -> Path:
+    """A video file -> events and its pictures, as one file; returns its name."""
+    path, clip = settings.output, settings.video
+    if path.suffix not in CLIP_SUFFIXES:
+        raise OutputError(f"{path}: with --video the output is one file: name it {path}.h5")
+    if path.is_dir() or (path.exists() and not settings.overwrite):
+        raise OutputError(f"{path} exists: choose another output or pass --overwrite")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{path.parent}: cannot make this folder ({error.strerror})") from error
+    size = parse_size(settings.sensor_size)
+    first = next(read_clip(clip, size), None)
+    if first is None:
+        raise ValueError(f"{clip}: holds no pictures: name a video file that does")
+    height, width = first.image.shape
+    sensor = with_faults(settings.sensor) if settings.faults else settings.sensor
+    camera = random_sensor(
+        jax.random.key(settings.seed), height=height, width=width, settings=sensor
+    )
+
+    def renderings():
+        # The sensor takes log intensity as linear between two renderings: these are the pictures.
+        with tqdm(unit="pictures", disable=None) as progress:
+            for picture in read_clip(clip, size):
+                yield picture.time, picture.image.astype(np.float32) / 255
+                progress.update()
+
+    record = describe(settings) | {"video": clip.name, "sensor_size": f"{width}x{height}"}
+    count = write_sequence(
+        path,
+        ahead(event_list(camera, renderings()), depth=4),
+        read_clip(clip, size),
+        height=height,
+        width=width,
+        settings=record,
+    )
+    print(f"{path}: {count:,} events of {width}x{height} pixels")
+    return path
+
+
+def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Picture]:
+    """A video file -> its pictures in grey, times from the first; scaled to (height, width).
+
+    Raises ValueError for what cannot be read, or whose times stand still or leave gaps.
+    """
+    first = last = None
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise ValueError(f"{path}: holds no video, only sound or text: name a video file")
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            period = 1 / (stream.average_rate or Fraction(25))
+            for number, frame in enumerate(container.decode(stream)):
+                seconds = number * period if frame.pts is None else frame.pts * frame.time_base
+                first = seconds if first is None else first
+                time = round((seconds - first) * 1_000_000)
+                if last is not None and not 0 < time - last <= LONGEST:
+                    raise ValueError(
+                        f"{path}: picture {number + 1} comes {(time - last) * 1e-6:g} s after the "
+                        f"one before, expected more than 0 and up to {LONGEST * 1e-6:.1f}: "
+                        "convert the clip to a constant rate"
+                    )
+                last = time
+                height, width = size or (frame.height, frame.width)
+                # By way of RGB: the grey plane of a video does not reach from 0 to 255.
+                rgb = frame.to_ndarray(format="rgb24", width=width, height=height)
+                grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
+                yield Picture(time, np.round(grey).astype(np.uint8), None)
+    except (av.FFmpegError, OSError) as error:
+        raise ValueError(
+            f"{path}: cannot be read as a video ({error.strerror or error}): name a file that "
+            "ffmpeg can play"
+        ) from error

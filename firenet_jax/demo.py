@@ -1,0 +1,204 @@
+"""Random scene -> events -> reconstruction -> video beside the truth: a trial without a recording.
+
+Everything between the photographs and the pictures runs on the device, a few windows at a time;
+memory does not grow with the demo's length. The numbers printed compare the network's images,
+clipped to [0, 1], with the truth at each window's end, after the state has warmed up.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from PIL import Image, ImageDraw, ImageFont
+from tqdm import tqdm
+
+from firenet_jax.checkpoint import load_weights
+from firenet_jax.events import parse_size
+from firenet_jax.metrics import mse, ssim, temporal_error
+from firenet_jax.network import Weights, initial_state
+from firenet_jax.overlap import ahead
+from firenet_jax.pictures import Display, display, event_pictures, initial_display_state
+from firenet_jax.reconstruction import reconstruct
+from firenet_jax.scenes import Scene, SceneSettings, load_textures, photographs, random_scene
+from firenet_jax.sensor import FAULTY, Sensor, SensorSettings, random_sensor, simulate
+from firenet_jax.video import check_output, open_writer
+
+WINDOWS = 10  # simulated and reconstructed at once
+RENDERINGS = 5  # in a window, with at most half a pixel of motion between two
+WARM_UP = 10  # windows from a zero state that the numbers leave out
+CAPTION = 16  # pixels above the pictures
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Simulate a moving scene, reconstruct it from its events, and show both side by side.
+
+    Examples:
+      firenet demo -o demo.mp4
+      firenet demo -o demo.gif --seconds 5 --seed 3 --faults
+    """
+
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """A name that ends in .mp4 or .gif, or a folder for png files: events (blue: brighter, red:
+    darker), reconstruction and truth, at natural speed."""
+    weights: Annotated[Path | None, tyro.conf.arg(aliases=["-c"])] = None
+    """Weights: .npz, a published PyTorch checkpoint, or the folder of a training run."""
+    seconds: float = 3.0
+    """How long the scene lasts."""
+    fps: float = 30.0
+    """Pictures per second; each is made of the events since the last."""
+    seed: int = 0
+    """Other numbers give other scenes."""
+    sensor_size: str = "240x180"
+    """WIDTHxHEIGHT of the simulated sensor."""
+    faults: bool = False
+    """What real sensors have: mismatch, noise, leak, hot pixels, finite bandwidth."""
+    overwrite: bool = False
+    """Replace an output that exists."""
+
+    def __post_init__(self):
+        if not 0 < self.seconds <= 60:
+            raise ValueError(f"seconds is {self.seconds}, but must be more than 0 and up to 60")
+        if not 1 <= self.fps <= 1000:
+            raise ValueError(f"fps is {self.fps}, but must be between 1 and 1000")
+        if self.seconds * self.fps < 1:
+            raise ValueError(f"{self.seconds} s at {self.fps} pictures per second hold no picture")
+        height, width = parse_size(self.sensor_size)
+        if min(height, width) < 16:
+            raise ValueError(f"a sensor of {width}x{height}: expected 16x16 or more")
+
+
+class Shown(NamedTuple):
+    """T windows of one sequence."""
+
+    events: jax.Array  # (T, H, W, 3) uint8
+    images: jax.Array  # (T, H, W) uint8, reconstructed
+    truth: jax.Array  # (T, H, W) uint8
+    errors: jax.Array  # (T, 3) float32: MSE, SSIM, temporal error
+
+
+def run(settings: Demo) -> dict[str, float]:
+    """Does what the settings say; returns the numbers it prints. Raises CheckpointError,
+    OutputError or ValueError with a message of one sentence."""
+    weights = load_weights(settings.weights)
+    check_output(settings.output, settings.overwrite)
+    height, width = parse_size(settings.sensor_size)
+    count = max(round(settings.seconds * settings.fps), 1)
+    period = 1e6 / settings.fps
+    sensor, scene = make_scene(settings, height, width)
+    writer = open_writer(settings.output, settings.fps)
+    errors = np.zeros(3)
+    warm_up = min(WARM_UP, count - 1)
+    shown = ahead(pictures(weights, sensor, scene, count, period, height, width), depth=1)
+    try:
+        caption = captions(["events", "reconstruction", "truth"], width)
+        with tqdm(total=count, unit="pictures", disable=None) as progress:
+            for number, (picture, numbers) in enumerate(shown):
+                writer.write(np.concatenate([caption, picture]), round((number + 1) * period))
+                errors += numbers if number >= warm_up else 0
+                progress.update()
+        writer.finish()
+    except BaseException:
+        writer.abandon()
+        raise
+    finally:
+        shown.close()
+    values = (errors / (count - warm_up)).tolist()
+    result = dict(zip(("mse", "ssim", "temporal_error"), values, strict=True))
+    print(
+        f"{settings.output}: {count} pictures of {width}x{height} pixels\n"
+        f"  MSE {result['mse']:.4f}, SSIM {result['ssim']:.3f}, temporal error "
+        f"{result['temporal_error']:.4f}: means over {count - warm_up} pictures, after "
+        f"{warm_up} of warm-up\n"
+        "  (intensities 0 to 1, not equalised; SSIM: Gaussian window of sigma 1.5, data range 1)"
+    )
+    return result
+
+
+def make_scene(settings: Demo, height: int, width: int) -> tuple[Sensor, Scene]:
+    """One sensor and one scene, each with a leading axis of 1. The fastest point moves as fast as
+    the renderings of a window allow, which suits the network too."""
+    scene_key, sensor_key = jax.random.split(jax.random.key(settings.seed))
+    # Photographs show best what a reconstruction is worth.
+    textures = load_textures(
+        count=16, size=320, seed=settings.seed, procedural=0.0 if photographs() else 1.0
+    )
+    scene = random_scene(
+        scene_key,
+        jnp.asarray(textures),
+        height=height,
+        width=width,
+        duration=settings.seconds,
+        speed=0.5 * RENDERINGS * settings.fps,
+        settings=SceneSettings(pause=0.0),
+    )
+    sensor = random_sensor(
+        sensor_key,
+        height=height,
+        width=width,
+        settings=FAULTY if settings.faults else SensorSettings(),
+    )
+    return jax.tree.map(lambda leaf: leaf[None], (sensor, scene))
+
+
+def pictures(
+    weights: Weights, sensor: Sensor, scene: Scene, count: int, period: float, height, width
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yields (H, 3 W, 3) uint8, events | reconstruction | truth, with (MSE, SSIM, temporal error),
+    for `count` windows of `period` microseconds."""
+    state = initial_state(1, height, width)
+    sensor_state = last = None
+    for start in range(0, count, WINDOWS):
+        bounds = np.round(np.arange(start, start + WINDOWS + 1) * period).astype(np.int32)
+        sensor_state, simulated = simulate(
+            sensor, scene, bounds[:, None], sensor_state,
+            height=height, width=width, renderings=RENDERINGS,
+        )  # fmt: skip
+        state, images = reconstruct(weights, state, simulated.tensors)
+        images = images[:, 0]
+        if last is None:  # the first picture has no predecessor; it belongs to the warm-up
+            last = images[0], simulated.images[0, 0]
+        last, shown = _show(simulated, images, last)
+        shown = jax.device_get(shown)
+        for t in range(min(WINDOWS, count - start)):
+            greys = [np.stack([grey[t]] * 3, -1) for grey in (shown.images, shown.truth)]
+            yield np.concatenate([shown.events[t], *greys], 1), shown.errors[t]
+
+
+@partial(jax.jit, static_argnames="settings")
+def _show(simulated, images, last, settings: Display = Display()):
+    """Windows of one sequence, images (T, H, W), and the last (image, truth) before them."""
+    tensors, truth, displacement, visible = (leaf[:, 0] for leaf in simulated)
+    _, greys = display(initial_display_state(1), images[:, None], settings=settings)
+    clipped = jnp.clip(images, 0.0, 1.0)
+    before = (
+        jnp.concatenate([one[None], all[:-1]])
+        for one, all in zip(last, (clipped, truth), strict=True)
+    )
+    previous, previous_truth = before
+    errors = jnp.stack(
+        [
+            mse(clipped, truth),
+            ssim(clipped, truth),
+            temporal_error(clipped, previous, displacement, truth, previous_truth, visible),
+        ],
+        -1,
+    )
+    eight_bit = jnp.round(jnp.clip(255 * truth, 0, 255)).astype(jnp.uint8)
+    shown = Shown(event_pictures(tensors), greys[:, 0], eight_bit, errors)
+    return (clipped[-1], truth[-1]), shown
+
+
+def captions(words: list[str], width: int) -> np.ndarray:
+    """A strip (CAPTION, len(words) width, 3) uint8 with each word centred above its picture."""
+    strip = Image.new("RGB", (len(words) * width, CAPTION), "white")
+    draw, font = ImageDraw.Draw(strip), ImageFont.load_default(11)
+    for k, word in enumerate(words):
+        draw.text(((k + 0.5) * width, CAPTION / 2), word, "black", font, anchor="mm")
+    return np.asarray(strip)

@@ -1,0 +1,116 @@
+"""Images, ground truths, optical flow -> loss: Eq. 2 of the paper over a sequence.
+
+Scheerlinck et al., "Fast Image Reconstruction with an Event Camera", WACV 2020:
+
+    loss = sum_{k=0..L} L_R(k) + lambda_TC sum_{k=L0..L} L_TC(k)
+
+Sums over the images of a sequence, not means; the mean over the batch. L_TC is
+`metrics.temporal_error`. L_R was LPIPS, whose network has to be downloaded; here it is a weighted
+sum of distances that need nothing, by default as large as LPIPS is for a good reconstruction
+(0.4 to 0.5), so that lambda_TC means the same.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from firenet_jax import metrics
+
+
+@dataclass(frozen=True)
+class Loss:
+    """The weights of Eq. 2; a term of weight 0 is not computed.
+
+    gmsd, haarpsi and cw_ssim cannot tell an image from its negative: never use them alone.
+    """
+
+    l1: float = 1.0
+    """Mean absolute difference."""
+    nlpd: float = 0.5
+    """Normalised Laplacian pyramid distance."""
+    ssim: float = 0.5
+    """1 - SSIM."""
+    ms_ssim: float = 0.0
+    """1 - MS-SSIM."""
+    gmsd: float = 0.0
+    """Gradient magnitude similarity deviation; blind to a negative."""
+    haarpsi: float = 0.0
+    """1 - HaarPSI; blind to a negative."""
+    cw_ssim: float = 0.0
+    """1 - complex wavelet SSIM; blind to a negative."""
+    random_features: float = 0.0
+    """Distance between the features of a random network."""
+    lambda_tc: float = 2.0
+    """Weight of the temporal consistency."""
+    l0: int = 10
+    """First image whose temporal consistency counts, because the state must warm up; 0 for a
+    sequence whose state is warm from the start."""
+    L: int = 20
+    """Last image of a sequence, counted from 0."""
+
+
+DISTANCES = {
+    "l1": metrics.l1,
+    "nlpd": metrics.nlpd,
+    "ssim": lambda image, truth: 1 - metrics.ssim(image, truth),
+    "ms_ssim": lambda image, truth: 1 - metrics.ms_ssim(image, truth),
+    "gmsd": metrics.gmsd,
+    "haarpsi": lambda image, truth: 1 - metrics.haarpsi(image, truth),
+    "cw_ssim": lambda image, truth: 1 - metrics.cw_ssim(image, truth),
+    "random_features": metrics.random_features,
+}
+
+
+def reconstruction_loss(
+    images: jax.Array, truths: jax.Array, settings: Loss = Loss()
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """L_R of every image: (..., H, W), (..., H, W) -> (...,), and its terms (...,) unweighted."""
+    weights = {name: getattr(settings, name) for name in DISTANCES}
+    terms = {name: DISTANCES[name](images, truths) for name in DISTANCES if weights[name]}
+    loss = sum((weights[name] * term for name, term in terms.items()), jnp.zeros(images.shape[:-2]))
+    return loss, terms
+
+
+def sequence_loss(
+    images: jax.Array,
+    truths: jax.Array,
+    displacements: jax.Array,
+    visible: jax.Array,
+    settings: Loss = Loss(),
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Eq. 2 for T images in time order, T at most L + 1 -> (loss, its terms).
+
+    images, truths: (T, B, H, W), image k is from the time of truth k, that of the last event.
+    displacements: (T, B, H, W, 2) pixels, x then y, from image k-1 to k on the grid of k.
+    visible: (T, B, H, W) bool, False where image k shows what image k-1 did not.
+    displacements[0] and visible[0] are not used: image 0 has no predecessor here.
+
+    loss: scalar. Terms: scalars, unweighted means over batch and images (only those that count,
+    for "temporal"), so that they compare between lengths; "reconstruction" is the mean of L_R:
+
+        loss = T reconstruction + lambda_TC (T - max(l0, 1)) temporal
+    """
+    steps = len(images)
+    if steps > settings.L + 1:
+        raise ValueError(
+            f"a sequence of {steps} images is longer than the L + 1 = {settings.L + 1} of the loss"
+        )
+    per_image, terms = reconstruction_loss(images, truths, settings)
+    terms = {"reconstruction": per_image, **terms}
+    loss = per_image.sum(0).mean()
+
+    first = max(settings.l0, 1)
+    if settings.lambda_tc and first < steps:
+        now, before = slice(first, None), slice(first - 1, -1)
+        errors = metrics.temporal_error(
+            images[now],
+            images[before],
+            displacements[now],
+            truths[now],
+            truths[before],
+            visible[now],
+        )  # (T - first, B)
+        loss += settings.lambda_tc * errors.sum(0).mean()
+        terms["temporal"] = errors
+    return loss, {name: term.mean() for name, term in terms.items()}

@@ -1,0 +1,785 @@
+"""Textures and camera motion -> intensity video and its optical flow, as pure functions of time.
+
+A scene is a textured plane under a camera that moves with six degrees of freedom, as in the
+paper, and several textured objects before it, each a plane of its own with its own motion and
+outline; the nearer hides the farther. Nothing is simulated step by step: `render` and `flow` give
+the picture and the exact displacement at any times, so frames can be as dense as a sensor asks.
+
+Times are seconds since the scene's start, float32. Images are (H, W) float32 in [0, 1], grey
+values as they stand in picture files (the published network was trained on these). Lengths in the
+world are pixels as seen at the rest distance of the background. All functions of JAX here are
+written for one scene; `jax.vmap` makes them functions of many. Pictures become textures
+(N, S, S) float32 on the host, in numpy and Pillow: `load_textures`.
+"""
+
+import importlib.util
+import math
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image, ImageDraw
+
+from firenet_jax.events import logger
+from firenet_jax.warp import sample
+
+WAVES = 3  # sinusoids in each of the six coordinates of a motion
+PAUSES = 2  # at most so many stops in a scene
+OUTLINE = 96  # cells on a side of an object's outline
+MARGIN = 1.3  # the outline's field reaches so many radii from the centre
+BLUR = 4  # pixels of the blurring kernel on each side of its middle
+
+
+@dataclass(frozen=True)
+class SceneSettings:
+    """What random scenes look like. Pairs are (least, greatest)."""
+
+    objects: int = 3
+    """Objects before the background; a scene shows between none and all of them."""
+    speed: tuple[float, float] = (3.0, 1000.0)
+    """Pixels per second of the fastest point at its fastest time, drawn log-uniformly."""
+    pause: float = 0.3
+    """How probable it is that everything stands still for a while, in each half of the scene."""
+    zoom: tuple[float, float] = (0.45, 1.1)
+    """Pixels of the image for one pixel of a texture, drawn log-uniformly for each plane. Textures
+    are blurred for that scale, so small ones do not flicker; above 1 they look unsharp."""
+    tilt: float = 0.3
+    """Radians by which planes lean away from the camera, at most."""
+    size: tuple[float, float] = (0.08, 0.3)
+    """Radius of the objects, in parts of the picture's larger side."""
+    softness: tuple[float, float] = (1.0, 3.0)
+    """Pixels over which an object's edge fades; drawn log-uniformly, 1 is a sharp edge."""
+    black: tuple[float, float] = (0.0, 0.08)
+    """Intensity of a texture's 0."""
+    white: tuple[float, float] = (0.85, 1.0)
+    """Intensity of a texture's 1."""
+    gamma: tuple[float, float] = (0.8, 1.25)
+    """Exponent applied to a texture's values, drawn log-uniformly."""
+    hdr: float = 0.0
+    """How probable it is that a scene lies partly in deep shadow, 10 to 100 times darker."""
+
+
+class Motion(NamedTuple):
+    """A smooth path through poses: each coordinate a sum of sinusoids of the way gone."""
+
+    amplitude: jax.Array  # (6, WAVES): x, y, z in pixels, rotation about x, y, z in radians
+    frequency: jax.Array  # (6, WAVES) radians for each unit of the way
+    phase: jax.Array  # (6, WAVES) radians
+    pace: jax.Array  # () units of the way per second, pauses apart
+
+
+class Scene(NamedTuple):
+    """K objects before a background; planes are numbered from the back, the background is 0."""
+
+    focal: jax.Array  # () pixels, also the distance of the background at rest
+    camera: Motion
+    places: jax.Array  # (K + 1, 6) each plane's pose at rest: centre and rotation
+    motions: Motion  # leading axis K + 1
+    # One array for each plane: looked up in a stack of them, each would be copied every time.
+    textures: tuple[jax.Array, ...]  # K + 1 of (S, S) intensities, blurred for their scale
+    density: jax.Array  # (K + 1,) texture pixels for each pixel in the world
+    origin: jax.Array  # (K + 1, 2) texture coordinates of the plane's centre
+    outlines: tuple[jax.Array, ...]  # K of (OUTLINE, OUTLINE) radii from the edge, inside > 0
+    radius: jax.Array  # (K, 2) in pixels in the world, and as seen at rest
+    softness: jax.Array  # (K,) pixels over which the edge fades
+    pauses: jax.Array  # (PAUSES, 3) seconds: start, end, and how long stopping takes
+    speed: jax.Array  # () pixels per second; no point of the picture moves faster
+
+
+class Rendering(NamedTuple):
+    """What the camera sees at one time."""
+
+    image: jax.Array  # (H, W) float32 in [0, 1]
+    plane: jax.Array  # (H, W) int32, the plane that covers most of the pixel
+
+
+# ---- Scenes
+
+
+@partial(jax.jit, static_argnames=("height", "width", "settings"))
+def random_scene(
+    key: jax.Array,
+    textures: jax.Array,
+    *,
+    height: int,
+    width: int,
+    duration: jax.Array | float = 2.0,
+    speed: jax.Array | float | None = None,
+    settings: SceneSettings = SceneSettings(),
+) -> Scene:
+    """key, textures (N, S, S) in [0, 1] -> a scene for pictures of this size and duration.
+
+    duration: seconds, over which pauses are placed and the speed is measured.
+    speed: pixels per second of the fastest point; None draws it from `settings.speed`.
+    """
+    planes, side = settings.objects + 1, float(max(height, width))
+    key, camera_key, object_keys, outline_keys, light_key = jax.random.split(key, 5)
+    uniform, log_uniform = _dice(key, 16 + 16 * planes)
+    if speed is None:
+        speed = log_uniform(settings.speed)
+    # An object's distance from the camera, in parts of the background's; the nearest comes last.
+    depth = jnp.sort(uniform((0.5, 0.95), (settings.objects,)))[::-1]
+    depth = jnp.concatenate([jnp.ones(1), depth])
+    focal = side * uniform((0.8, 1.6))
+    camera = _camera_motion(camera_key, focal, side)
+    objects = jax.vmap(_object_motion, (0, None, 0))(
+        jax.random.split(object_keys, planes), side, depth
+    )
+    still = jnp.arange(planes) == 0
+    objects = objects._replace(amplitude=jnp.where(still[:, None, None], 0.0, objects.amplitude))
+
+    centres = uniform((-0.4, 0.4), (planes, 2)) * depth[:, None] * jnp.array([[width, height]])
+    centres = jnp.where(still[:, None], 0.0, centres)
+    leaning = uniform((-settings.tilt, settings.tilt), (planes, 2))
+    turned = uniform((-0.3, 0.3), (planes, 1)) * jnp.where(still, 1.0, 5.0)[:, None]
+    places = jnp.concatenate([centres, focal * depth[:, None], leaning, turned], -1)
+
+    zoom = log_uniform(settings.zoom, (planes,))
+    size = textures.shape[-1]
+    chosen = textures[_whole(uniform((0.0, textures.shape[0]), (planes,)), textures.shape[0])]
+    lit = _lit(light_key, chosen, settings)
+    # An optical blur of half a pixel keeps the picture free of aliasing; planes are seen up to a
+    # fifth farther away than at rest, and looking up bilinearly already blurs by 0.4 texture
+    # pixels.
+    sigma = jnp.sqrt(jnp.maximum((0.5 * 1.2 / zoom) ** 2 - 0.4**2, 1e-4))
+    canvases = jax.vmap(_blurred)(lit, sigma)
+    origin = (size - 1) / 2 + uniform((-0.15, 0.15), (planes, 2)) * size
+
+    outlines = jax.vmap(_outline)(jax.random.split(outline_keys, settings.objects))
+    shown = _whole(uniform((0.0, settings.objects + 1)), settings.objects + 1)
+    absent = jnp.arange(settings.objects) >= shown
+    outlines = jnp.where(absent[:, None, None], -jnp.float32(side), outlines)
+    seen_radius = side * log_uniform(settings.size, (settings.objects,))
+
+    # One pause at most in each half, so that two never overlap.
+    ramp = 0.02 * duration
+    start = duration * (uniform((0.02, 0.3), (PAUSES,)) + jnp.arange(PAUSES) / PAUSES)
+    length = duration * uniform((0.02, 0.5 - 0.3 - 0.02), (PAUSES,))
+    length = jnp.where(uniform((0.0, 1.0), (PAUSES,)) < settings.pause, length, 0.0)
+    pauses = jnp.stack([start, start + length, jnp.broadcast_to(ramp, (PAUSES,))], -1)
+
+    scene = Scene(
+        focal=focal,
+        camera=camera,
+        places=places,
+        motions=objects,
+        textures=tuple(canvases),
+        density=1 / (zoom * depth),
+        origin=origin,
+        outlines=tuple(outlines),
+        radius=jnp.stack([seen_radius * depth[1:], seen_radius], -1),
+        softness=log_uniform(settings.softness, (settings.objects,)),
+        pauses=pauses,
+        speed=jnp.asarray(speed, jnp.float32),
+    )
+    # The camera leads; objects move by themselves between a tenth and once as fast.
+    scene = _at_pace(scene, 1.0 / side, log_uniform((0.1, 1.0), (planes,)))
+    return _at_speed(scene, speed, duration, height, width)
+
+
+def _dice(key: jax.Array, count: int):
+    """key -> two functions (bounds, shape) -> random numbers, uniform and log-uniform.
+
+    All are drawn at once and handed out in turn: dozens of separate draws take XLA's CPU compiler
+    ten seconds.
+    """
+    numbers, place = jax.random.uniform(key, (count,)), 0
+
+    def uniform(bounds, shape=()):
+        nonlocal place
+        first, place = place, place + math.prod(shape)
+        if place > count:
+            raise ValueError(f"more than {count} random numbers are needed")
+        low, high = bounds
+        return low + (high - low) * numbers[first:place].reshape(shape)
+
+    def log_uniform(bounds, shape=()):
+        return jnp.exp(uniform([math.log(bound) for bound in bounds], shape))
+
+    return uniform, log_uniform
+
+
+def _whole(numbers: jax.Array, count: int) -> jax.Array:
+    """Uniform in [0, count] -> 0 .. count - 1."""
+    return jnp.clip(numbers.astype(jnp.int32), 0, count - 1)
+
+
+def _waves(uniform, log_uniform, amplitude: jax.Array) -> Motion:
+    """Amplitudes (6,) -> a random motion whose coordinates reach about so far."""
+    share = uniform((0.2, 1.0), (6, WAVES))
+    return Motion(
+        amplitude=amplitude[:, None] * share / share.sum(-1, keepdims=True),
+        frequency=log_uniform((0.4, 2.5), (6, WAVES)),
+        phase=uniform((0.0, 2 * math.pi), (6, WAVES)),
+        pace=jnp.ones(()),
+    )
+
+
+def _camera_motion(key: jax.Array, focal: jax.Array, side: float) -> Motion:
+    """Handheld: sideways by up to half a picture, nearer and farther by up to a fifth, turning."""
+    uniform, log_uniform = _dice(key, 6 + 18 * WAVES)
+    across = side * uniform((0.1, 0.5), (2,))
+    along = focal * uniform((0.0, 0.2), (1,))
+    turn = jnp.array([0.12, 0.12, 0.4]) * uniform((0.0, 1.0), (3,))
+    return _waves(uniform, log_uniform, jnp.concatenate([across, along, turn]))
+
+
+def _object_motion(key: jax.Array, side: float, depth: jax.Array) -> Motion:
+    """Across up to half of the picture, with a tumble."""
+    uniform, log_uniform = _dice(key, 6 + 18 * WAVES)
+    across = side * depth * uniform((0.05, 0.5), (2,))
+    along = side * depth * uniform((0.0, 0.1), (1,))
+    turn = jnp.array([0.15, 0.15, 0.8]) * uniform((0.0, 1.0), (3,))
+    return _waves(uniform, log_uniform, jnp.concatenate([across, along, turn]))
+
+
+def _lit(key: jax.Array, textures: jax.Array, settings: SceneSettings) -> jax.Array:
+    """Texture values (planes, S, S) -> intensities: one gamma, black and white for the scene."""
+    planes, size = textures.shape[:2]
+    uniform, log_uniform = _dice(key, 5 + 3 * planes)
+    gamma = log_uniform(settings.gamma)
+    black, white = uniform(settings.black), uniform(settings.white)
+    lit = black + (white - black) * jnp.maximum(textures, 1e-4) ** gamma
+    if settings.hdr == 0:
+        return lit
+    # Bands of light and shadow across each plane, their edges soft.
+    depth = jnp.where(uniform((0.0, 1.0)) < settings.hdr, jnp.log(log_uniform((10, 100))), 0.0)
+    slope, phase = uniform((-1.5, 1.5), (planes, 2)), uniform((0.0, 2 * math.pi), (planes,))
+    ramp = 2 * jnp.pi * jnp.arange(size, dtype=jnp.float32) / size
+    waves = slope[:, :1, None] * ramp[None, None] + slope[:, 1:, None] * ramp[None, :, None]
+    shade = 0.5 + 0.5 * jnp.tanh(3 * jnp.sin(waves + phase[:, None, None]))
+    return lit * jnp.exp(-depth * shade)
+
+
+def _blurred(image: jax.Array, sigma: jax.Array) -> jax.Array:
+    """(S, S) -> the same under a Gaussian of this many pixels, mirrored at the border."""
+    distance = jnp.arange(-BLUR, BLUR + 1, dtype=jnp.float32)
+    weights = jnp.exp(-0.5 * (distance / sigma) ** 2)
+    weights = weights / weights.sum()
+    for axis in (0, 1):
+        padded = jnp.pad(image, [(BLUR * (a == axis),) * 2 for a in (0, 1)], mode="reflect")
+        size = image.shape[axis]
+        image = sum(
+            weights[k] * jax.lax.slice_in_dim(padded, k, k + size, axis=axis)
+            for k in range(2 * BLUR + 1)
+        )
+    return image
+
+
+def _outline(key: jax.Array) -> jax.Array:
+    """An object's form: distance from its edge in radii, positive inside, (OUTLINE, OUTLINE).
+
+    Blobs, regular polygons, stars and rings: the edge is a function of the angle.
+    """
+    uniform, log_uniform = _dice(key, 16)
+    place = jnp.linspace(-MARGIN, MARGIN, OUTLINE)
+    y, x = jnp.meshgrid(place, place, indexing="ij")
+    border = MARGIN - 0.05 - jnp.maximum(jnp.abs(x), jnp.abs(y))
+    stretch = log_uniform((0.67, 1.5))
+    x, y = x * jnp.maximum(stretch**2, 1.0), y * jnp.maximum(stretch**-2, 1.0)  # only slimmer
+    r, angle = jnp.hypot(x, y), jnp.arctan2(y, x)
+
+    waves = jnp.arange(2, 6, dtype=jnp.float32)
+    phases, sizes = uniform((0.0, 2 * math.pi), (4,)), uniform((0.0, 0.35), (4,)) / waves
+    bumps = [sizes[k] * jnp.sin(waves[k] * angle + phases[k]) for k in range(4)]
+    blob = 0.8 + sum(bumps)
+    corners = 3.0 + _whole(uniform((0.0, 5.0)), 5)
+    half = jnp.pi / corners
+    polygon = jnp.cos(half) / jnp.cos(jnp.mod(angle, 2 * half) - half)
+    star = 0.75 + 0.25 * jnp.cos(corners * angle)
+    kind = _whole(uniform((0.0, 4.0)), 4)
+    edge = jnp.choose(kind, [blob, polygon, star, jnp.ones_like(r)], mode="clip")
+    # A quarter of all are hollow, polygons and stars too.
+    hole = jnp.where(uniform((0.0, 1.0)) < 0.25, 0.35, -1.0)
+    # Nothing reaches the border, whose values stand for all beyond it.
+    return jnp.minimum(jnp.minimum(edge - r, r - hole), border)
+
+
+def _at_pace(scene: Scene, camera: float, objects: jax.Array) -> Scene:
+    """The scene with these paces, the objects' in parts of the camera's."""
+    return scene._replace(
+        camera=scene.camera._replace(pace=jnp.asarray(camera, jnp.float32)),
+        motions=scene.motions._replace(pace=camera * objects),
+    )
+
+
+def _at_speed(scene: Scene, speed, duration, height: int, width: int) -> Scene:
+    """The scene, its paces scaled until the fastest point reaches this speed but never more.
+
+    A faster pace sees more of the path, and so perhaps a faster part of it: hence the rounds.
+    The speed is measured at 128 times; 5 % cover what happens between them.
+    """
+    times = duration * jnp.linspace(0.0, 1.0, 128)
+
+    def paced(scene, factor):
+        objects = scene.motions._replace(pace=scene.motions.pace * factor)
+        camera = scene.camera._replace(pace=scene.camera.pace * factor)
+        return scene._replace(camera=camera, motions=objects)
+
+    def improve(round, carry):
+        scene, _ = carry
+        peak = 1.05 * speeds(scene, times, height=height, width=width).max()
+        factor = speed / jnp.maximum(peak, 1e-6)
+        # The later rounds only slow down, so that the bound holds; the last only measures.
+        most = jnp.array([jnp.inf, jnp.inf, jnp.inf, 1.0, 1.0, 1.0])[round]
+        factor = jnp.where(round == 6, 1.0, jnp.minimum(factor, most))
+        return paced(scene, factor), peak
+
+    scene, peak = jax.lax.fori_loop(0, 7, improve, (scene, jnp.zeros(())))
+    return scene._replace(speed=peak)
+
+
+# ---- Poses
+
+
+def _clock(pauses: jax.Array, t: jax.Array) -> jax.Array:
+    """Seconds -> seconds without the pauses, differentiable: stopping and starting are smooth."""
+
+    def run(x):  # the integral of the smooth step 3 x^2 - 2 x^3, which goes from 0 to 1
+        inside = jnp.clip(x, 0.0, 1.0)
+        return inside**3 - 0.5 * inside**4 + jnp.maximum(x - 1, 0.0)
+
+    start, end, ramp = pauses[:, 0], pauses[:, 1], pauses[:, 2]
+    return t - (ramp * (run((t - start) / ramp) - run((t - end) / ramp))).sum()
+
+
+def _pose(motion: Motion, clock: jax.Array) -> jax.Array:
+    """(6,): x, y, z in pixels and rotations in radians."""
+    way = motion.pace * clock
+    return (motion.amplitude * jnp.sin(motion.frequency * way + motion.phase)).sum(-1)
+
+
+def _product(a: jax.Array, b: jax.Array) -> jax.Array:
+    """3x3 matrices, entry by entry: so small a product is slower, and not safe, as a dot on CPUs
+    (jax-ml/jax#39103)."""
+    return (a[:, :, None] * b[None, :, :]).sum(1)
+
+
+def _rotation(angles: jax.Array) -> jax.Array:
+    """Angles about x, y, z (3,) -> rotation (3, 3), about x first."""
+    (cx, cy, cz), (sx, sy, sz) = jnp.cos(angles), jnp.sin(angles)
+    return jnp.stack(
+        [
+            jnp.stack([cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx]),
+            jnp.stack([sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx]),
+            jnp.stack([-sy, cy * sx, cy * cx]),
+        ]
+    )
+
+
+def _to_image(scene: Scene, t: jax.Array, height: int, width: int) -> jax.Array:
+    """Homographies (K + 1, 3, 3) at time t: coordinates on each plane -> the image's (x, y)."""
+    clock = _clock(scene.pauses, jnp.asarray(t, jnp.float32))
+    camera = _pose(scene.camera, clock)
+    turn = _rotation(camera[3:])
+    # Distances in parts of the focal length, so that all entries are of the order of 1.
+    lens = jnp.stack(
+        [
+            jnp.array([1.0, 0.0, (width - 1) / 2]),
+            jnp.array([0.0, 1.0, (height - 1) / 2]),
+            jnp.array([0.0, 0.0, 1.0]),
+        ]
+    )
+    scale = jnp.stack([jnp.ones(()), jnp.ones(()), 1 / scene.focal])[:, None]
+
+    def one(place, motion):
+        pose = place + _pose(motion, clock)
+        axes = _rotation(pose[3:])
+        plane = jnp.concatenate([axes[:, :2], (pose - camera)[:3, None]], 1)
+        return _product(lens, scale * _product(turn, plane))
+
+    return jax.vmap(one)(scene.places, scene.motions)
+
+
+def _inverse(matrices: jax.Array) -> jax.Array:
+    """(K, 3, 3) -> their inverses, by cross products."""
+    a, b, c = matrices[:, 0], matrices[:, 1], matrices[:, 2]
+    adjugate = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], -1)
+    determinant = (a * jnp.cross(b, c)).sum(-1)
+    return adjugate / determinant[:, None, None]
+
+
+def _project(matrix: jax.Array, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Homography (3, 3), coordinates of one shape -> coordinates of that shape."""
+    m = matrix
+    # What lies behind the camera is pushed far away instead of coming back upside down.
+    nearness = 1 / jnp.maximum(m[2, 0] * x + m[2, 1] * y + m[2, 2], 0.01)
+    return (
+        (m[0, 0] * x + m[0, 1] * y + m[0, 2]) * nearness,
+        (m[1, 0] * x + m[1, 1] * y + m[1, 2]) * nearness,
+    )
+
+
+@partial(jax.jit, static_argnames=("height", "width"))
+def speeds(scene: Scene, t: jax.Array, *, height: int, width: int) -> jax.Array:
+    """Times (n,) -> pixels per second of the fastest point of the picture at each, (n,).
+
+    Measured, from the motions' derivatives, at nine points of the picture for the background and
+    at nine of its bounding box for each object.
+    """
+    corners = jnp.array([-1.0, 0.0, 1.0])
+    box_y, box_x = (grid.ravel() for grid in jnp.meshgrid(corners, corners, indexing="ij"))
+    last_x, last_y = width - 1.0, height - 1.0
+    exists = jnp.stack([jnp.bool_(True), *(outline.max() > 0 for outline in scene.outlines)])
+
+    def at(t):
+        to_image = _to_image(scene, t, height, width)
+        to_plane = _inverse(to_image)
+        x = (0.5 + 0.5 * box_x) * last_x
+        y = (0.5 + 0.5 * box_y) * last_y
+        reach = MARGIN * scene.radius[:, :1]
+        boxes = jax.vmap(_project)(to_image[1:], reach * box_x[None], reach * box_y[None])
+        # Only what is in the picture counts.
+        x = jnp.concatenate([x[None], jnp.clip(boxes[0], 0.0, last_x)])
+        y = jnp.concatenate([y[None], jnp.clip(boxes[1], 0.0, last_y)])
+        points = jax.vmap(_project)(to_plane, x, y)
+
+        def positions(t):
+            return jax.vmap(_project)(_to_image(scene, t, height, width), *points)
+
+        _, (dx, dy) = jax.jvp(positions, (t,), (jnp.ones(()),))
+        fastest = jnp.hypot(dx, dy).max(-1)  # (K + 1,)
+        return jnp.where(exists, fastest, 0.0).max()
+
+    return jax.vmap(at)(jnp.asarray(t, jnp.float32))
+
+
+# ---- Pictures and flow
+
+
+def _grid(height: int, width: int) -> tuple[jax.Array, jax.Array]:
+    row, column = jnp.arange(height, dtype=jnp.float32), jnp.arange(width, dtype=jnp.float32)
+    y, x = jnp.meshgrid(row, column, indexing="ij")
+    return x, y
+
+
+def _colour(scene: Scene, k: int, u: jax.Array, v: jax.Array) -> jax.Array:
+    """Intensity of plane k at its coordinates; textures go on, mirrored, for ever."""
+    size = scene.textures[k].shape[-1]
+
+    def mirrored(x):
+        period = 2.0 * (size - 1)
+        return jnp.abs(x - period * jnp.round(x * (1 / period)))
+
+    u = mirrored(scene.origin[k, 0] + scene.density[k] * u)
+    v = mirrored(scene.origin[k, 1] + scene.density[k] * v)
+    return sample(scene.textures[k], u, v)
+
+
+def _inside(scene: Scene, k: int, u: jax.Array, v: jax.Array) -> jax.Array:
+    """Pixels from the edge of object k (from 1) at its coordinates, positive inside."""
+    radius, seen = scene.radius[k - 1]
+    centre = (OUTLINE - 1) / 2
+    cells = centre / (MARGIN * radius)
+    return seen * sample(scene.outlines[k - 1], centre + cells * u, centre + cells * v)
+
+
+@partial(jax.jit, static_argnames=("height", "width"))
+def render(scene: Scene, t: jax.Array, *, height: int, width: int) -> Rendering:
+    """The picture at time t, and which plane is in front."""
+    x, y = _grid(height, width)
+    to_plane = _inverse(_to_image(scene, t, height, width))
+    image = _colour(scene, 0, *_project(to_plane[0], x, y))
+    plane = jnp.zeros((height, width), jnp.int32)
+    for k in range(1, len(scene.textures)):  # from back to front
+        u, v = _project(to_plane[k], x, y)
+        inside = _inside(scene, k, u, v)
+        cover = jnp.clip(0.5 + inside / scene.softness[k - 1], 0.0, 1.0)
+        image = image + cover * (_colour(scene, k, u, v) - image)
+        plane = jnp.where(inside >= 0, k, plane)
+    return Rendering(image, plane)
+
+
+@partial(jax.jit, static_argnames=("height", "width"))
+def flow(
+    scene: Scene, t0: jax.Array, t1: jax.Array, *, height: int, width: int
+) -> tuple[jax.Array, jax.Array]:
+    """How the picture moved from t0 to t1: displacement (H, W, 2) float32, visible (H, W) bool.
+
+    On the grid of the picture at t1, in pixels, x then y: what is at x now was at x - d(x) then,
+    so `warp(image at t0, displacement)` shows the picture at t1 where it is visible. Exact, from
+    the homographies. Not visible is what was outside the picture at t0 or behind an object, and
+    what lies within a pixel of an edge, where a pixel mixes two motions.
+    """
+    x, y = _grid(height, width)
+    now, then = (_to_image(scene, t, height, width) for t in (t1, t0))
+    now_to_plane, then_to_plane = _inverse(now), _inverse(then)
+    planes = len(scene.textures)
+    # Where an edge has faded to a tenth, and the pixel more that bilinear interpolation reaches.
+    edge = 1.0 + 0.4 * scene.softness
+
+    x0, y0 = _project(then[0], *_project(now_to_plane[0], x, y))
+    front = jnp.zeros((height, width), jnp.int32)
+    visible = jnp.ones((height, width), bool)
+    for k in range(1, planes):
+        u, v = _project(now_to_plane[k], x, y)
+        inside = _inside(scene, k, u, v)
+        owned, mixed = inside >= 0, jnp.abs(inside) < edge[k - 1]
+        x0_k, y0_k = _project(then[k], u, v)
+        x0, y0 = jnp.where(owned, x0_k, x0), jnp.where(owned, y0_k, y0)
+        front = jnp.where(owned, k, front)
+        # An object that covers a pixel wholly also covers the edges behind it.
+        visible = (visible | owned) & ~mixed
+    # Else XLA computes these anew for each of their uses.
+    x0, y0, front, visible = jax.lax.optimization_barrier((x0, y0, front, visible))
+    for k in range(1, planes):
+        u, v = _project(then_to_plane[k], x0, y0)
+        visible &= ~((front < k) & (_inside(scene, k, u, v) > -edge[k - 1]))
+    visible &= (x0 >= 0) & (x0 <= width - 1) & (y0 >= 0) & (y0 <= height - 1)
+    return jnp.stack([x - x0, y - y0], -1), visible
+
+
+def rendering_times(
+    scene: Scene,
+    bounds: np.ndarray,
+    *,
+    height: int,
+    width: int,
+    pixels: float = 0.5,
+    longest: int = 10_000,
+) -> np.ndarray:
+    """When to render so that nothing moves more than half a pixel between two renderings.
+
+    bounds: (n,) int64 microseconds since the scene's start, all of which are rendered (ends of
+    windows, frames). Returns int64 microseconds from the first to the last of them, dense where
+    the scene is fast and never farther apart than `longest`.
+    """
+    bounds = np.unique(np.asarray(bounds, np.int64))
+    grid = np.union1d(np.arange(bounds[0], bounds[-1], 1000), bounds)
+    padded = np.pad(grid, (0, -len(grid) % 1024), mode="edge")  # few sizes, few compilations
+    speed = np.asarray(speeds(scene, padded * 1e-6, height=height, width=width))[: len(grid)]
+    speed = 1.1 * np.maximum(speed[1:], speed[:-1])  # whichever end of a millisecond is faster
+    rate = np.maximum(speed * 1e-6 / pixels, 1 / longest)  # renderings for each microsecond
+    done = np.concatenate([[0.0], np.cumsum(rate * np.diff(grid))])
+    at = done[np.searchsorted(grid, bounds)]
+    counts = np.maximum(np.ceil(np.diff(at)), 1).astype(int)
+    steps = [
+        np.linspace(*ends, count, endpoint=False)
+        for ends, count in zip(np.stack([at[:-1], at[1:]], -1), counts, strict=True)
+    ]
+    times = np.round(np.interp(np.concatenate([*steps, at[-1:]]), done, grid)).astype(np.int64)
+    return np.union1d(times, bounds)
+
+
+@partial(jax.jit, static_argnames=("height", "width"))
+def _images(scene: Scene, times: jax.Array, *, height: int, width: int) -> jax.Array:
+    return jax.lax.map(lambda t: render(scene, 1e-6 * t, height=height, width=width).image, times)
+
+
+def video(
+    scene: Scene, times: np.ndarray, *, height: int, width: int, chunk: int = 16
+) -> Iterator[tuple[int, jax.Array]]:
+    """Microseconds since the scene's start (n,) -> each of them with its image (H, W)."""
+    times = np.asarray(times, np.int32)
+    for start in range(0, len(times), chunk):
+        part = times[start : start + chunk]
+        padded = np.pad(part, (0, chunk - len(part)), mode="edge")  # one size, one compilation
+        images = _images(scene, padded, height=height, width=width)
+        yield from zip(part.tolist(), images[: len(part)], strict=True)
+
+
+# ---- Textures
+
+PHOTOGRAPHS = (  # of those that come with scikit-image itself, not downloaded by it
+    "astronaut.png", "brick.png", "camera.png", "chelsea.png", "coffee.png",
+    "coins.png", "grass.png", "gravel.png", "hubble_deep_field.jpg", "ihc.png", "moon.png",
+    "motorcycle_left.png", "motorcycle_right.png", "page.png", "retina.jpg", "rocket.jpg",
+)  # fmt: skip
+SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
+
+
+def load_textures(
+    folder: str | Path | None = None,
+    count: int = 64,
+    size: int = 256,
+    seed: int = 0,
+    procedural: float | None = None,
+) -> np.ndarray:
+    """Pictures -> textures (count, size, size) float32 in [0, 1], grey, cut at random.
+
+    folder: of pictures (searched with its subfolders; .jpg, .png and others); only as many as
+    are asked for are opened. None: the photographs that come with scikit-image, where installed.
+    procedural: part of the textures that is drawn instead (`PROCEDURAL`); None: none of them
+    where a folder is named, else a quarter.
+    Raises ValueError where the folder holds no picture that can be used.
+    """
+    rng = np.random.default_rng(seed)
+    if procedural is None:
+        procedural = 0.25 if folder is None else 0.0
+    paths = photographs() if folder is None else _pictures(Path(folder))
+    drawn = round(procedural * count) if paths else count
+    textures = _cuttings(rng, paths, count - drawn, size, folder) if count > drawn else []
+    kinds = list(PROCEDURAL.values())
+    textures += [kinds[k % len(kinds)](rng, size) for k in range(drawn)]
+    return np.stack(textures).astype(np.float32)
+
+
+def photographs() -> list[Path]:
+    """The pictures inside scikit-image's wheel; none where it is not installed."""
+    spec = importlib.util.find_spec("skimage")
+    if spec is None or not spec.submodule_search_locations:
+        return []
+    folder = Path(spec.submodule_search_locations[0]) / "data"
+    return [folder / name for name in PHOTOGRAPHS if (folder / name).exists()]
+
+
+def _pictures(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: no such folder: name one with pictures in it")
+    found = [
+        Path(at) / name
+        for at, _, names in os.walk(folder)
+        for name in names
+        if name.lower().endswith(SUFFIXES)
+    ]
+    if not found:
+        raise ValueError(
+            f"{folder}: holds no pictures ({', '.join(SUFFIXES)}): name a folder that does"
+        )
+    return sorted(found)
+
+
+def _cuttings(rng, paths: list[Path], count: int, size: int, folder) -> list[np.ndarray]:
+    """Random squares of random pictures, each picture once before any comes again."""
+    cuttings, usable = [], list(paths)
+    problem = ""
+    while len(cuttings) < count:
+        if not usable:
+            raise ValueError(
+                f"{folder or 'scikit-image'}: none of {len(paths)} pictures can be used for "
+                f"textures of {size} pixels; the last: {problem}"
+            )
+        chosen = rng.permutation(len(usable))[: count - len(cuttings)]
+        bad = set()
+        for k in chosen:
+            try:
+                cuttings.append(_cutting(rng, usable[k], size))
+            except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+                problem = f"{usable[k]}: {error}"
+                logger.warning("not used: %s", problem)
+                bad.add(k)
+        usable = [path for k, path in enumerate(usable) if k not in bad]
+    return cuttings
+
+
+def _cutting(rng, path: Path, size: int) -> np.ndarray:
+    """A square of 70 to 100 % of the picture's shorter side, perhaps mirrored, as (size, size)."""
+    with Image.open(path) as picture:
+        if min(picture.size) < size // 2:
+            width, height = picture.size
+            raise ValueError(f"{width}x{height} is too small, {size // 2} pixels are needed")
+        picture.draft("L", (size, size))  # lets JPEG decode at half or a quarter of its size
+        grey = picture.convert("L")
+    side = rng.uniform(0.7, 1.0) * min(grey.size)
+    left, top = (rng.uniform(0, length - side) for length in grey.size)
+    box = (left, top, left + side, top + side)
+    grey = grey.resize((size, size), Image.Resampling.LANCZOS, box, reducing_gap=3.0)
+    values = np.asarray(grey, np.float32) / 255
+    return values[:, ::-1] if rng.random() < 0.5 else values
+
+
+def _stretched(values: np.ndarray, rng) -> np.ndarray:
+    """Any values -> [0, 1], the darkest and the lightest percent clipped, contrast at random."""
+    low, high = np.percentile(values, [1, 99])
+    values = np.clip((values - low) / max(high - low, 1e-9), 0, 1)
+    contrast = rng.uniform(0.5, 1.0)
+    return rng.uniform(0, 1 - contrast) + contrast * values
+
+
+def clouds(rng, size: int) -> np.ndarray:
+    """Noise whose amplitude falls with frequency, as that of natural pictures does."""
+    frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None])
+    frequency[0, 0] = np.inf
+    spectrum = np.fft.rfft2(rng.normal(size=(size, size))) * frequency ** -rng.uniform(1.0, 2.0)
+    return _stretched(np.fft.irfft2(spectrum, (size, size)), rng)
+
+
+def gratings(rng, size: int) -> np.ndarray:
+    """Sums of one to three sinusoidal or square waves of any direction."""
+    y, x = np.mgrid[:size, :size]
+    values = np.zeros((size, size))
+    for _ in range(rng.integers(1, 4)):
+        angle, phase = rng.uniform(0, 2 * np.pi, 2)
+        wave = 2 * np.pi / np.exp(rng.uniform(np.log(6), np.log(size / 4)))
+        values += np.sin(wave * (np.cos(angle) * x + np.sin(angle) * y) + phase)
+    if rng.random() < 0.5:  # edges two pixels wide
+        values = np.tanh(values * size / 64)
+    return _stretched(values, rng)
+
+
+def _drawing(rng, size: int, draw: Callable) -> np.ndarray:
+    """What `draw(ImageDraw, side)` draws, at three times the size and then averaged."""
+    canvas = Image.new("L", (3 * size, 3 * size), int(rng.integers(0, 256)))
+    draw(ImageDraw.Draw(canvas), 3 * size)
+    return np.asarray(canvas.resize((size, size), Image.Resampling.BOX), np.float32) / 255
+
+
+def dead_leaves(rng, size: int) -> np.ndarray:
+    """Discs that hide each other, many small and few large: the occlusions of natural pictures."""
+
+    def draw(canvas, side):
+        # radii with density r^-3 between 1/100 and 1/4 of the side
+        low, high = (0.01 * side) ** -2, (0.25 * side) ** -2
+        for _ in range(1500):
+            r = (high + rng.random() * (low - high)) ** -0.5
+            x, y = rng.uniform(-r, side + r, 2)
+            canvas.ellipse([x - r, y - r, x + r, y + r], fill=int(rng.integers(0, 256)))
+
+    return _drawing(rng, size, draw)
+
+
+def polygons(rng, size: int) -> np.ndarray:
+    """Random polygons and lines, flat and sharp."""
+
+    def draw(canvas, side):
+        for _ in range(rng.integers(10, 60)):
+            centre = rng.uniform(0, side, 2)
+            reach = side * np.exp(rng.uniform(np.log(0.03), np.log(0.3)))
+            angles = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 8)))
+            corners = centre + reach * np.stack([np.cos(angles), np.sin(angles)], -1)
+            grey = int(rng.integers(0, 256))
+            if rng.random() < 0.3:
+                canvas.line([tuple(c) for c in corners[:2]], fill=grey, width=side // 60)
+            else:
+                canvas.polygon([tuple(c) for c in corners], fill=grey)
+
+    return _drawing(rng, size, draw)
+
+
+def marks(rng, size: int) -> np.ndarray:
+    """Rows of small strokes, like a printed page."""
+
+    def draw(canvas, side):
+        paper, ink = (rng.uniform(170, 255), rng.uniform(0, 90))
+        if rng.random() < 0.3:
+            paper, ink = ink, paper
+        canvas.rectangle([0, 0, side, side], fill=int(paper))
+        letter = side * rng.uniform(0.02, 0.06)
+        for top in np.arange(letter / 2, side, 1.7 * letter):
+            x = letter / 2
+            while x < side:
+                if rng.random() < 0.15:  # between words
+                    x += letter
+                    continue
+                for _ in range(rng.integers(2, 5)):
+                    ends = rng.uniform(0, 1, (2, 2)) * [0.7 * letter, letter] + [x, top]
+                    width = max(1, round(0.14 * letter))
+                    canvas.line([tuple(end) for end in ends], fill=int(ink), width=width)
+                x += 0.9 * letter
+
+    return _drawing(rng, size, draw)
+
+
+PROCEDURAL = {
+    "dead_leaves": dead_leaves,
+    "clouds": clouds,
+    "gratings": gratings,
+    "polygons": polygons,
+    "marks": marks,
+}

@@ -1,0 +1,475 @@
+"""Intensity video -> events, or event tensors directly on the device: ESIM's sensor, with faults.
+
+One model, two outputs which agree: `event_list` gives time-sorted `Events` on the host, `simulate`
+event tensors that never leave the device. Both call `step` for each rendering of the scene:
+
+    L = log(0.001 + I);  a pixel emits an event, p = +1 or -1, each time L, taken as linear between
+    two renderings, crosses reference + p C_p; the reference moves by p C_p, also when the
+    refractory period swallows the event.
+
+(Rebecq et al., "ESIM: an open event camera simulator", CoRL 2018.) L being linear, the events of a
+pixel between two renderings are equally spaced, and so are those that the refractory period
+leaves: a `Run`. Times are whole microseconds, as sensors stamp them. On the device they count from
+the interval's start, in integers of 1/1024 us, which both outputs round alike; an interval may
+last two seconds. (What crosses in the last half microsecond of a window is stamped with its end:
+the tensor on the device counts it there, who cuts the list into [start, end) in the next window.)
+
+Images are (H, W) float32 in [0, 1]; sensors, states and runs are of one sequence, and `jax.vmap`
+makes batches of them.
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from firenet_jax.events import Events, concatenate
+from firenet_jax.scenes import Scene, SceneSettings, flow, random_scene, render
+from firenet_jax.tensors import BINS
+
+EPS = 0.001
+TICKS = 1024  # in a microsecond
+AT_ONCE = 4  # events of a pixel in one pass over the picture: fewer passes, less memory traffic
+LONGEST = 2**31 // TICKS - 1  # microseconds between two renderings
+
+
+@dataclass(frozen=True)
+class SensorSettings:
+    """The sensor; as it stands the paper's, without faults. Pairs are (least, greatest), drawn
+    log-uniformly for each sequence; (0, 0) switches a fault off."""
+
+    threshold: float = 0.18
+    """Mean of the contrast thresholds, in log intensity."""
+    threshold_spread: float = 0.03
+    """Standard deviation of the thresholds, ON and OFF each drawn once for a sequence."""
+    threshold_range: tuple[float, float] | None = None
+    """Draw the ON threshold log-uniformly from here instead, OFF within 10 % of it."""
+    refractory: float = 1e-3
+    """Seconds after an event in which a pixel stays silent."""
+    mismatch: float = 0.0
+    """Standard deviation of each pixel's own thresholds, in log intensity; about 0.03 in life."""
+    noise: tuple[float, float] = (0.0, 0.0)
+    """Shot noise: events per second and pixel, ON or OFF, at any time."""
+    leak: tuple[float, float] = (0.0, 0.0)
+    """ON events per second by which every pixel's reference drifts, about 0.1 in sensors."""
+    hot: tuple[float, float] = (0.0, 0.0)
+    """Part of the pixels that are hot: 10 to 500 events per second, ON or OFF, without end."""
+    cutoff: tuple[float, float] = (0.0, 0.0)
+    """Hertz: bandwidth of the pixels, a first-order low-pass on log intensity."""
+    cutoff_dark: float = 0.1
+    """Bandwidth in the dark, in parts of that in full light; 1: it depends on no light."""
+
+
+FAULTY = SensorSettings(
+    mismatch=0.03,
+    noise=(0.1, 10.0),
+    leak=(0.01, 0.5),
+    hot=(1e-4, 1e-3),
+    cutoff=(100.0, 1000.0),
+)
+"""Everything on, as much as real sensors show."""
+
+
+class Sensor(NamedTuple):
+    """The sensor of one sequence; a fault that is off is None, and costs nothing."""
+
+    on: jax.Array  # () or (H, W) threshold in log intensity
+    off: jax.Array
+    refractory: jax.Array | None  # () int32, ticks
+    drift: jax.Array | None  # (H, W) log intensity per second, by which L seems to rise
+    noise: jax.Array | None  # () events per second and pixel
+    cutoff: jax.Array | None  # (2,) hertz in full light, and the part of it left in the dark
+    phase: jax.Array | None  # (H, W) part of the first threshold already gone, where L drifts:
+    # else all pixels would leak their first event at the same time
+    key: jax.Array  # of the noise
+
+
+class SensorState(NamedTuple):
+    """What the pixels remember from one rendering to the next."""
+
+    log: jax.Array  # (H, W) float32, L after the low-pass
+    above: jax.Array  # (H, W) float32, L above the reference: small, so no rounding adds up
+    silent: jax.Array | None  # (H, W) int32, ticks until the refractory period is over
+    renderings: jax.Array  # () int32, how many so far: they number the noise
+
+
+class Run(NamedTuple):
+    """Events of each pixel between two renderings: at first, first + spacing, ... (H, W)."""
+
+    first: jax.Array  # int32, ticks after the earlier rendering
+    spacing: jax.Array  # int32, ticks
+    count: jax.Array  # int32
+    polarity: jax.Array  # float32, +1 or -1
+
+
+# ---- The model
+
+
+@partial(jax.jit, static_argnames=("height", "width", "settings"))
+def random_sensor(
+    key: jax.Array, *, height: int, width: int, settings: SensorSettings = SensorSettings()
+) -> Sensor:
+    """The sensor of a sequence: thresholds and faults, drawn once."""
+    shape = height, width
+    number_key, spread_key, mismatch_key, drift_key, noise_key = jax.random.split(key, 5)
+    numbers = iter(jax.random.uniform(number_key, (5,)))
+    spread = jax.random.normal(spread_key, (2,))
+
+    def log_uniform(bounds):
+        low, high = (math.log(bound) for bound in bounds)
+        return jnp.exp(low + (high - low) * next(numbers))
+
+    if settings.threshold_range is None:
+        on, off = settings.threshold + settings.threshold_spread * spread
+    else:
+        on = log_uniform(settings.threshold_range)
+        off = on * (1 + 0.1 * spread[0])
+    if settings.mismatch:
+        own = settings.mismatch * jax.random.normal(mismatch_key, (2, *shape))
+        on, off = on + own[0], off + own[1]
+    on, off = (jnp.maximum(threshold, 0.01) for threshold in (on, off))  # as in ESIM
+
+    drift = phase = None
+    if settings.leak[1] or settings.hot[1]:
+        chance, sign, rate, phase = jax.random.uniform(drift_key, (4, *shape))
+        drift = jnp.zeros(shape)
+        if settings.leak[1]:
+            drift += on * log_uniform(settings.leak)
+        if settings.hot[1]:
+            rate = 10.0 * 50.0**rate * jnp.where(sign < 0.5, on, -off)
+            drift = jnp.where(chance < log_uniform(settings.hot), rate, drift)
+    return Sensor(
+        on=on,
+        off=off,
+        refractory=jnp.int32(settings.refractory * 1e6 * TICKS) if settings.refractory else None,
+        drift=drift,
+        noise=log_uniform(settings.noise) if settings.noise[1] else None,
+        cutoff=jnp.stack([log_uniform(settings.cutoff), jnp.float32(settings.cutoff_dark)])
+        if settings.cutoff[1]
+        else None,
+        phase=phase,
+        key=noise_key,
+    )
+
+
+def log_intensity(image: jax.Array) -> jax.Array:
+    return jnp.log(EPS + image)
+
+
+def first_state(sensor: Sensor, image: jax.Array) -> SensorState:
+    """The first rendering (H, W) sets every pixel's reference."""
+    log = log_intensity(image)
+    above = jnp.zeros_like(log)
+    if sensor.drift is not None:
+        drifted = jnp.where(sensor.drift > 0, sensor.on, -sensor.off) * sensor.phase
+        above = jnp.where(sensor.drift != 0, drifted, above)
+    silent = None if sensor.refractory is None else jnp.zeros(image.shape, jnp.int32)
+    return SensorState(log, above, silent, jnp.int32(0))
+
+
+def step(
+    sensor: Sensor, state: SensorState, image: jax.Array, duration: jax.Array
+) -> tuple[SensorState, tuple[Run, ...]]:
+    """A rendering (H, W), `duration` microseconds (int32) after the last -> (state, its events).
+
+    One run of each pixel's crossings, and a second one of shot noise where there is any.
+    """
+    seconds = 1e-6 * duration.astype(jnp.float32)
+    ticks = TICKS * duration  # int32
+    before, after = state.log, log_intensity(image)
+    if sensor.cutoff is not None:
+        cutoff, dark = sensor.cutoff
+        rate = 2 * jnp.pi * cutoff * (dark + (1 - dark) * image)
+        after = before - jnp.expm1(-seconds * rate) * (after - before)
+
+    rise = after - before
+    if sensor.drift is not None:
+        rise = rise + seconds * sensor.drift  # seen from a reference that sinks, L rises
+
+    up = rise > 0
+    polarity = jnp.where(up, 1.0, -1.0)
+    threshold = jnp.where(up, sensor.on, sensor.off)
+    above = state.above + rise
+    crossings = jnp.maximum(jnp.floor(polarity * above / threshold), 0.0)
+    size = jnp.abs(rise)
+    size = jnp.where(size > 0, size, 1.0)  # no rise, no crossing: anything finite will do
+    scale = ticks.astype(jnp.float32) / size
+    # The first crossing, from the interval's start; rounding may put it a little outside. The
+    # spacing is rounded down, so that the last crossing stays inside.
+    first = threshold - polarity * state.above
+    first = jnp.clip(jnp.round(first * scale), 0.0, ticks.astype(jnp.float32)).astype(jnp.int32)
+    spacing = jnp.minimum(threshold * scale, ticks.astype(jnp.float32)).astype(jnp.int32)
+    count = crossings.astype(jnp.int32)
+    above = above - polarity * threshold * crossings
+    run = Run(first, spacing, count, polarity)
+    silent = None
+    if sensor.refractory is not None:
+        run, silent = _refractory(run, state.silent, sensor.refractory, ticks)
+
+    runs = (run,)
+    if sensor.noise is not None:
+        key = jax.random.fold_in(sensor.key, state.renderings)
+        runs += (_shot_noise(key, seconds * sensor.noise, image.shape, ticks),)
+    return SensorState(after, above, silent, state.renderings + 1), runs
+
+
+def _refractory(run: Run, silent: jax.Array, refractory: jax.Array, ticks: jax.Array):
+    """All crossings -> those at which the pixel may speak, and for how long it is silent then.
+
+    Of equally spaced crossings the first one after the silence speaks, and then each n-th, n the
+    least with n spacings not shorter than the refractory period: again equally spaced.
+    """
+    spacing = jnp.maximum(run.spacing, 1).astype(jnp.float32)
+    wait = jnp.maximum(silent - run.first, 0).astype(jnp.float32)
+    skipped = jnp.ceil(wait / spacing)
+    stride = jnp.maximum(jnp.ceil(refractory.astype(jnp.float32) / spacing), 1.0)
+    left = jnp.maximum(run.count.astype(jnp.float32) - skipped, 0.0)
+    count = jnp.ceil(left / stride).astype(jnp.int32)
+    # Numbers that belong to no event may be large: they must not leave int32.
+    first = jnp.where(count > 0, skipped, 0.0).astype(jnp.int32) * run.spacing + run.first
+    spacing = jnp.where(count > 1, stride, 0.0).astype(jnp.int32) * run.spacing
+    last = first + (count - 1) * spacing
+    silent = jnp.where(count > 0, last + refractory, silent)
+    return Run(first, spacing, count, run.polarity), jnp.maximum(silent - ticks, 0)
+
+
+def _shot_noise(key: jax.Array, expected: jax.Array, shape, ticks: jax.Array) -> Run:
+    """At most one event a pixel and interval, at any time in it, ON or OFF alike.
+
+    Noise does not move the reference, nor does it wait for the refractory period. One random
+    number decides all: where it is below the probability, it is uniform below it.
+    """
+    chance = -jnp.expm1(-expected)  # at least one event of a Poisson process
+    number = jax.random.bits(key, shape, jnp.uint32).astype(jnp.float32) * 2.0**-32
+    fires = number < chance
+    place = 2 * number / jnp.where(chance > 0, chance, 1.0)  # [0, 2): polarity and time
+    polarity = jnp.where(place < 1, 1.0, -1.0)
+    first = (ticks.astype(jnp.float32) * jnp.mod(place, 1.0)).astype(jnp.int32)
+    return Run(first, jnp.zeros(shape, jnp.int32), fires.astype(jnp.int32), polarity)
+
+
+def _stamps(first, spacing, number):
+    """Microseconds after the interval's start of a run's number-th event; numpy or JAX, int32."""
+    return (first + number * spacing + TICKS // 2) // TICKS
+
+
+# ---- Event lists
+
+
+@jax.jit
+def _listed(sensor, state, image, duration):
+    state, runs = step(sensor, state, image, duration)
+    fired = runs[0].count.sum() if len(runs) == 1 else (runs[0].count + runs[1].count).sum()
+    return state, runs, fired
+
+
+def event_list(sensor: Sensor, renderings: Iterable[tuple[int, np.ndarray]]) -> Iterator[Events]:
+    """(microseconds, image (H, W)) in time order -> chunks of time-sorted events, one per interval.
+
+    The first rendering gives no events. How dense renderings must be is said by
+    `scenes.rendering_times`. Raises ValueError where time does not advance, or by more than two
+    seconds.
+    """
+    state = previous = None
+    for time, image in renderings:
+        time, image = int(time), jnp.asarray(image, jnp.float32)
+        if state is None:
+            state, previous = _first(sensor, image), time
+            continue
+        duration = time - previous
+        if not 0 < duration <= LONGEST:
+            raise ValueError(
+                f"renderings at {previous} and {time} us: each must come after the last, by at "
+                f"most {LONGEST} us"
+            )
+        state, runs, fired = _listed(sensor, state, image, jnp.int32(duration))
+        if int(fired):
+            yield _events(jax.device_get(runs), previous)
+        previous = time
+
+
+_first = jax.jit(first_state)
+
+
+def _events(runs: tuple[Run, ...], start: int) -> Events:
+    """Runs on the host -> their events, sorted by time."""
+    chunks = []
+    for run in runs:
+        y, x = np.nonzero(run.count)
+        first, spacing, count = run.first[y, x], run.spacing[y, x], run.count[y, x]
+        row = np.repeat(np.arange(len(count)), count)
+        number = np.arange(len(row), dtype=np.int32) - np.repeat(np.cumsum(count) - count, count)
+        t = _stamps(first[row], spacing[row], number.astype(np.int32))
+        on = run.polarity[y, x][row] > 0
+        chunks.append(Events.of(start + t.astype(np.int64), x[row], y[row], on))
+    events = concatenate(chunks)
+    return events.select(np.argsort(events.t, kind="stable"))
+
+
+# ---- Event tensors
+
+
+class Simulation(NamedTuple):
+    """T windows of B sequences. `pictures` and `displacement` belong to the windows' ends."""
+
+    tensors: jax.Array  # (T, B, H, W, 5) float32, not normalised, window bounds as t_min and t_max
+    images: jax.Array  # (T, B, H, W) float32 in [0, 1], the truth at the window's end
+    displacement: jax.Array  # (T, B, H, W, 2) float32 pixels, from the window's start to its end
+    visible: jax.Array  # (T, B, H, W) bool, where the displacement leads to a visible place
+
+
+@partial(jax.jit, static_argnames=("height", "width", "renderings"))
+def simulate(
+    sensors: Sensor,
+    scenes: Scene,
+    bounds: jax.Array,
+    state: SensorState | None = None,
+    *,
+    height: int,
+    width: int,
+    renderings: int = 5,
+) -> tuple[SensorState, Simulation]:
+    """B sensors before B scenes -> event tensors and truth, all on the device.
+
+    bounds: (T + 1, B) int32, microseconds since the scenes' start; window t lasts from t to t + 1.
+    state: what the last call returned, to go on where it ended; None starts afresh.
+    renderings: so many in each window, equally spaced. Nothing moves by more than half a pixel
+    from one to the next where windows last at most renderings / 2 / scene.speed seconds.
+    """
+    draw = jax.vmap(lambda scene, t: render(scene, t, height=height, width=width).image)
+    move = jax.vmap(partial(flow, height=height, width=width))
+    shape = bounds.shape[1], height, width
+    if state is None:
+        state = jax.vmap(first_state)(sensors, draw(scenes, 1e-6 * bounds[0]))
+
+    # The renderings of a window are a loop of their own: unrolled, they compile twice as long.
+    span = min(-(-(BINS - 1) // renderings) + 2, BINS)  # bins that the votes of one can reach
+
+    def window(state, ends):
+        start, end = ends  # (B,)
+
+        def rendering(carry, k):
+            state, planes, passed, _ = carry
+            until = (k + 1) * (end - start) // renderings
+            image = draw(scenes, 1e-6 * (start + until))
+            state, runs = jax.vmap(step)(sensors, state, image, until - passed)
+            low = jnp.minimum((BINS - 1) * k // renderings, BINS - span)
+            votes = jax.lax.dynamic_slice_in_dim(planes, low, span)
+            votes = _votes(votes, low, runs, passed, end - start)
+            planes = jax.lax.dynamic_update_slice_in_dim(planes, votes, low, 0)
+            return (state, planes, until, image), None
+
+        planes, image = jnp.zeros((BINS, *shape)), jnp.zeros(shape)
+        carry = state, planes, jnp.zeros_like(start), image
+        (state, planes, _, image), _ = jax.lax.scan(rendering, carry, jnp.arange(renderings))
+        displacement, visible = move(scenes, 1e-6 * start, 1e-6 * end)
+        return state, Simulation(planes.transpose(1, 2, 3, 0), image, displacement, visible)
+
+    return jax.lax.scan(window, state, (bounds[:-1], bounds[1:]))
+
+
+def _votes(planes: jax.Array, low, runs, passed: jax.Array, total: jax.Array) -> jax.Array:
+    """Adds the votes of runs (B, H, W) by Eq. 1 to planes (n, B, H, W), the bins from `low` on.
+
+    passed: (B,) int32, microseconds from the window's start to the interval's; total: those that
+    the window lasts. Events of a pixel are taken one after the other, all pixels at once, until
+    the busiest has no more.
+    """
+    passed, total = passed[:, None, None], total[:, None, None]
+    scale = (BINS - 1) / total.astype(jnp.float32)
+
+    def vote(planes, run, number):
+        stamp = passed + _stamps(run.first, run.spacing, number)
+        t_star = stamp.astype(jnp.float32) * scale
+        weight = jnp.where(number < run.count, run.polarity, 0.0)
+        return [
+            plane + weight * jnp.maximum(0.0, 1 - jnp.abs(low + n - t_star))
+            for n, plane in enumerate(planes)
+        ]
+
+    planes, run = list(planes), runs[0]
+    most = run.count.max()
+
+    def several(carry):
+        number, planes = carry
+        for n in range(AT_ONCE):
+            planes = vote(planes, run, number + n)
+        return number + AT_ONCE, planes
+
+    _, planes = jax.lax.while_loop(lambda carry: carry[0] < most, several, (jnp.int32(0), planes))
+    for run in runs[1:]:  # noise: one event at most
+        planes = vote(planes, run, 0)
+    return jnp.stack(planes)
+
+
+@partial(
+    jax.jit,
+    static_argnames=(
+        "batch",
+        "windows",
+        "height",
+        "width",
+        "renderings",
+        "motion",
+        "scene",
+        "sensor",
+    ),
+)
+def sequences(
+    key: jax.Array,
+    textures: jax.Array,
+    *,
+    batch: int,
+    windows: int,
+    height: int,
+    width: int,
+    renderings: int = 5,
+    motion: tuple[float, float] = (1.25, 2.5),
+    scene: SceneSettings = SceneSettings(),
+    sensor: SensorSettings = SensorSettings(),
+) -> Simulation:
+    """key, textures (N, S, S) -> training data: random scenes before random sensors.
+
+    The windows of a sequence all last equally long: so that at its fastest time the fastest point
+    moves by so many pixels as `motion` says (least, greatest; log-uniform), but 1 to 300 ms.
+    Raises ValueError where that is more than half a pixel from one rendering to the next.
+    """
+    if motion[1] > 0.5 * renderings:
+        raise ValueError(
+            f"windows with {motion[1]} pixels of motion need {math.ceil(2 * motion[1])} "
+            f"renderings, not {renderings}"
+        )
+    scene_key, sensor_key, speed_key, motion_key = jax.random.split(key, 4)
+
+    def log_uniform(key, low, high):
+        return jnp.exp(
+            jax.random.uniform(key, (batch,), minval=math.log(low), maxval=math.log(high))
+        )
+
+    speed = log_uniform(speed_key, *scene.speed)
+    moved = log_uniform(motion_key, *motion)
+    duration = jnp.clip(1e6 * moved / speed, 1e3, 3e5).astype(jnp.int32)
+    speed = jnp.minimum(speed, 1e6 * 0.5 * renderings / duration)
+
+    def one(key, duration, speed):
+        return random_scene(
+            key,
+            textures,
+            height=height,
+            width=width,
+            duration=1e-6 * windows * duration,
+            speed=speed,
+            settings=scene,
+        )
+
+    scenes = jax.vmap(one)(jax.random.split(scene_key, batch), duration, speed)
+    sensors = jax.vmap(partial(random_sensor, height=height, width=width, settings=sensor))(
+        jax.random.split(sensor_key, batch)
+    )
+    bounds = jnp.arange(windows + 1, dtype=jnp.int32)[:, None] * duration[None]
+    return simulate(sensors, scenes, bounds, height=height, width=width, renderings=renderings)[1]

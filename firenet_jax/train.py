@@ -1,0 +1,271 @@
+"""Simulated sequences -> parameters: one jitted step simulates, scans, and updates.
+
+Step n is a function of the seed, n and the state alone, so a run that was interrupted and resumed
+is the run that was not. A run is a folder:
+
+    settings.json     what was asked for
+    log.jsonl         one line for each logged step: losses, seconds
+    checkpoints/      the whole state (orbax), the newest two
+    weights.npz       the parameters that did best on the validation sequences so far
+"""
+
+import dataclasses
+import json
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import orbax.checkpoint as ocp
+import tyro
+from tqdm import tqdm
+
+from firenet_jax import metrics
+from firenet_jax.checkpoint import load_weights, save_weights
+from firenet_jax.events import logger
+from firenet_jax.losses import Loss, sequence_loss
+from firenet_jax.network import State, Weights, initial_params, initial_state, step
+from firenet_jax.scenes import SceneSettings, load_textures
+from firenet_jax.sensor import FAULTY, SensorSettings, Simulation, sequences
+from firenet_jax.tensors import normalise
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train FireNet on sequences that are simulated as it goes.
+
+    Examples:
+      firenet train -o run
+      firenet train -o run --images coco/train2017 --steps 100000
+      firenet train -o tuned --weights firenet.npz --learning-rate 1e-4
+    """
+
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder of the run; an interrupted run in it goes on."""
+    weights: Annotated[Path | None, tyro.conf.arg(aliases=["-c"])] = None
+    """Start from these weights instead of random ones."""
+    images: Path | None = None
+    """Folder of pictures for textures (default: scikit-image's photographs, and drawn ones)."""
+    textures: int = 256
+    """How many textures to cut from them."""
+    steps: int = 20_000
+    batch: int = 2
+    """Sequences in a step."""
+    size: int = 96
+    """Height and width of the sequences, in pixels."""
+    windows: int = 21
+    """Windows in a sequence, L + 1 in the paper."""
+    renderings: int = 5
+    """Renderings in a window."""
+    learning_rate: float = 1e-3
+    """Greatest rate of Adam, after warming up; it then falls to a hundredth along a cosine."""
+    warmup: int = 200
+    """Steps in which the rate rises from zero."""
+    clip: float = 1.0
+    """Gradients are scaled down to this norm."""
+    seed: int = 0
+    bfloat16: bool = False
+    """Convolutions in bfloat16."""
+    remat: bool = False
+    """Compute each step's maps again for the gradient: less memory, more time."""
+    log_every: int = 20
+    validate_every: int = 500
+    save_every: float = 120.0
+    """Seconds between two checkpoints."""
+    loss: Loss = Loss()
+    scene: SceneSettings = SceneSettings()
+    sensor: SensorSettings = dataclasses.replace(FAULTY, threshold_range=(0.1, 0.6))
+
+    def __post_init__(self):
+        for name in ("textures", "steps", "batch", "size", "renderings", "learning_rate", "clip"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, but must be more than 0")
+        if not self.loss.l0 < self.windows <= self.loss.L + 1:
+            raise ValueError(
+                f"windows is {self.windows}, but the loss is over more than {self.loss.l0} and at "
+                f"most {self.loss.L + 1} of them"
+            )
+        if self.warmup >= self.steps:
+            raise ValueError(f"warmup is {self.warmup} steps of {self.steps}: use fewer")
+
+
+class TrainState(NamedTuple):
+    """All that a step needs from the last one."""
+
+    params: Any
+    optimiser: Any
+    step: jax.Array  # () int32
+
+
+def optimiser(settings: Train) -> optax.GradientTransformation:
+    """Adam with clipped gradients; a step whose gradient is not finite changes nothing."""
+    rate = optax.warmup_cosine_decay_schedule(
+        0.0, settings.learning_rate, settings.warmup, settings.steps, settings.learning_rate / 100
+    )
+    adam = optax.chain(optax.clip_by_global_norm(settings.clip), optax.adam(rate))
+    return optax.apply_if_finite(adam, max_consecutive_errors=10)
+
+
+def initial_train_state(settings: Train) -> TrainState:
+    if settings.weights is None:
+        params = initial_params(jax.random.key(settings.seed))
+    else:
+        params = jax.tree.map(jnp.asarray, load_weights(settings.weights).params)
+    return TrainState(params, optimiser(settings).init(params), jnp.int32(0))
+
+
+def simulated(key: jax.Array, textures: jax.Array, settings: Train) -> Simulation:
+    return sequences(
+        key,
+        textures,
+        batch=settings.batch,
+        windows=settings.windows,
+        height=settings.size,
+        width=settings.size,
+        renderings=settings.renderings,
+        scene=settings.scene,
+        sensor=settings.sensor,
+    )
+
+
+def images_of(params, tensors: jax.Array, settings: Train) -> jax.Array:
+    """Event tensors (T, B, H, W, 5), not normalised -> images (T, B, H, W), from a zero state."""
+    run = partial(step, dtype=jnp.bfloat16 if settings.bfloat16 else jnp.float32)
+    run = jax.checkpoint(run) if settings.remat else run
+
+    def body(state: State, tensor: jax.Array):
+        return run(params, state, tensor)
+
+    return jax.lax.scan(body, initial_state(*tensors.shape[1:4]), normalise(tensors))[1]
+
+
+@partial(jax.jit, static_argnames="settings", donate_argnames="state")
+def train_step(
+    state: TrainState, key: jax.Array, textures: jax.Array, settings: Train
+) -> tuple[TrainState, dict[str, jax.Array]]:
+    """(state, the run's key, textures (N, S, S)) -> (state, losses): simulate, scan, update."""
+    data = simulated(jax.random.fold_in(key, state.step), textures, settings)
+
+    def loss_of(params):
+        images = images_of(params, data.tensors, settings)
+        return sequence_loss(images, data.images, data.displacement, data.visible, settings.loss)
+
+    (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params)
+    updates, optimised = optimiser(settings).update(gradient, state.optimiser, state.params)
+    params = optax.apply_updates(state.params, updates)
+    terms = {"loss": loss, "gradient": optax.tree.norm(gradient), **terms}
+    return TrainState(params, optimised, state.step + 1), terms
+
+
+@partial(jax.jit, static_argnames="settings")
+def validate(params, key: jax.Array, textures: jax.Array, settings: Train) -> dict:
+    """Losses and metrics of one fixed batch; metrics over its images from l0 on, clipped."""
+    data = simulated(key, textures, settings)
+    images = images_of(params, data.tensors, settings)
+    loss, terms = sequence_loss(images, data.images, data.displacement, data.visible, settings.loss)
+    shown, truths = jnp.clip(images[settings.loss.l0 :], 0, 1), data.images[settings.loss.l0 :]
+    return {
+        "loss": loss,
+        "temporal": terms.get("temporal", jnp.zeros(())),
+        "mse": metrics.mse(shown, truths).mean(),
+        "ssim": metrics.ssim(shown, truths).mean(),
+    }
+
+
+def run(settings: Train) -> None:
+    """Trains as the settings say, going on where an interrupted run stopped."""
+    folder = settings.output
+    _same_settings(folder, settings)
+    training, held_out = textures_of(settings)
+    key, validation_key = jax.random.split(jax.random.key(settings.seed + 1))
+    validation_keys = jax.random.split(validation_key, 8)
+    state = initial_train_state(settings)
+    options = ocp.CheckpointManagerOptions(max_to_keep=2)
+    with ocp.CheckpointManager((folder / "checkpoints").absolute(), options=options) as saved:
+        if saved.latest_step() is not None:
+            state = saved.restore(saved.latest_step(), args=ocp.args.StandardRestore(state))
+            logger.warning("%s: going on after step %d", folder, state.step)
+        log = Log(folder / "log.jsonl", int(state.step))
+        best = log.best()
+        last_save, done = time.monotonic(), int(state.step)
+        with tqdm(total=settings.steps, initial=done, unit="step", disable=None) as progress:
+            while done < settings.steps:
+                state, terms = train_step(state, key, training, settings)
+                done += 1
+                progress.update()
+                if done % settings.log_every == 0 or done == settings.steps:
+                    terms = log.write(done, "train", terms)
+                    progress.set_postfix(loss=f"{terms['loss']:.3f}", refresh=False)
+                    _check_finite(terms, state, folder)
+                if done % settings.validate_every == 0 or done == settings.steps:
+                    scores = [
+                        validate(state.params, k, held_out, settings) for k in validation_keys
+                    ]
+                    means = jax.tree.map(lambda *values: np.mean(values), *scores)
+                    means = log.write(done, "validation", means)
+                    if means["loss"] < best:
+                        best = means["loss"]
+                        save_weights(folder / "weights.npz", Weights(_host(state.params), True))
+                    save_weights(folder / "last.npz", Weights(_host(state.params), True))
+                if time.monotonic() - last_save > settings.save_every or done == settings.steps:
+                    saved.save(done, args=ocp.args.StandardSave(state))
+                    last_save = time.monotonic()
+    print(f"{folder / 'weights.npz'}: best validation loss {best:.4f} in {done} steps")
+
+
+def textures_of(settings: Train) -> tuple[jax.Array, jax.Array]:
+    """Textures to train on, and others, cut from other pictures, to validate on."""
+    size = 256
+    training = load_textures(settings.images, settings.textures, size, settings.seed)
+    held_out = load_textures(settings.images, 32, size, settings.seed + 1)
+    return jnp.asarray(training), jnp.asarray(held_out)
+
+
+class Log:
+    """Lines of JSON; those beyond the checkpoint from which a run goes on are dropped."""
+
+    def __init__(self, path: Path, step: int):
+        self.path, self.start = path, time.monotonic()
+        lines = path.read_text().splitlines() if path.exists() else []
+        self.entries = [entry for line in lines if (entry := json.loads(line))["step"] <= step]
+        path.write_text("".join(json.dumps(entry) + "\n" for entry in self.entries))
+
+    def write(self, step: int, kind: str, values: dict) -> dict[str, float]:
+        values = {name: float(value) for name, value in values.items()}
+        entry = {"step": step, "kind": kind, **values, "seconds": time.monotonic() - self.start}
+        with self.path.open("a") as file:
+            file.write(json.dumps(entry) + "\n")
+        return values
+
+    def best(self) -> float:
+        """The least validation loss so far."""
+        losses = [entry["loss"] for entry in self.entries if entry["kind"] == "validation"]
+        return min(losses, default=float("inf"))
+
+
+def _host(params):
+    return jax.tree.map(np.asarray, jax.device_get(params))
+
+
+def _check_finite(terms: dict[str, float], state: TrainState, folder: Path) -> None:
+    if not np.isfinite(terms["loss"]) and int(state.optimiser.notfinite_count) >= 10:
+        raise ValueError(
+            f"{folder}: ten steps in a row had no finite gradient, training has diverged: start "
+            "again with a smaller --learning-rate"
+        )
+
+
+def _same_settings(folder: Path, settings: Train) -> None:
+    """Keeps the settings in the folder; raises ValueError if a run of others is there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    choices = {k: v for k, v in dataclasses.asdict(settings).items() if k != "output"}
+    text = json.dumps(choices, default=str, indent=1)
+    path = folder / "settings.json"
+    if path.exists() and path.read_text() != text:
+        raise ValueError(f"{folder} holds a run with other settings: choose another --output")
+    path.write_text(text)

@@ -1,0 +1,427 @@
+import json
+import math
+
+import av
+import h5py
+import jax
+import numpy as np
+import pytest
+
+from firenet_jax import cli, dataset
+from firenet_jax.dataset import Picture, Simulate, read_clip, rounded_flow, run, write_sequence
+from firenet_jax.events import Events, concatenate
+from firenet_jax.readers import open_recording
+from firenet_jax.scenes import SceneSettings, load_textures
+from firenet_jax.sensor import EPS, FAULTY, SensorSettings
+from firenet_jax.video import OutputError, write_video
+from firenet_jax.warp import warp
+
+HEIGHT, WIDTH = 24, 32
+
+
+@pytest.fixture(autouse=True)
+def few_textures(monkeypatch):
+    """Textures take longer to draw than the sequences of a test."""
+    textures = load_textures(count=4, size=64, procedural=1.0)
+    monkeypatch.setattr(dataset, "load_textures", lambda *_: textures)
+    dataset._textures.cache_clear()
+    yield
+    dataset._textures.cache_clear()
+
+
+def settings(output, **changes):
+    standard = {"sequences": 3, "validation": 1, "seconds": 0.2, "sensor_size": f"{WIDTH}x{HEIGHT}",
+                "scene": SceneSettings(speed=(20.0, 100.0))}  # fmt: skip
+    return Simulate(output, **(standard | changes))
+
+
+def random_events(count, seed=0, last=1_000_000):
+    rng = np.random.default_rng(seed)
+    return Events.of(
+        np.sort(rng.integers(0, last, count)),
+        rng.integers(0, WIDTH, count),
+        rng.integers(0, HEIGHT, count),
+        rng.integers(0, 2, count),
+    )
+
+
+def random_pictures(times, seed=0):
+    rng = np.random.default_rng(seed)
+    return [
+        Picture(
+            time,
+            rng.integers(0, 256, (HEIGHT, WIDTH), np.uint8),
+            rng.normal(size=(2, HEIGHT, WIDTH)).astype(np.float32),
+        )
+        for time in times
+    ]
+
+
+def in_pieces(events, size):
+    for start in range(0, len(events), size):
+        yield events.select(slice(start, start + size))
+
+
+def contents(path):
+    """Everything in a file: {name: array}, {name: attributes}."""
+    arrays, attributes = {}, {}
+    with h5py.File(path) as file:
+        attributes["/"] = dict(file.attrs)
+
+        def visit(name, item):
+            attributes[name] = dict(item.attrs)
+            if isinstance(item, h5py.Dataset):
+                arrays[name] = item[:]
+
+        file.visititems(visit)
+    return arrays, attributes
+
+
+def same(path, other):
+    """Whether two files hold the same arrays and attributes, bit for bit."""
+    (arrays, attributes), (others, other_attributes) = contents(path), contents(other)
+    return (
+        arrays.keys() == others.keys()
+        and all(np.array_equal(arrays[name], others[name]) for name in arrays)
+        and repr(attributes) == repr(other_attributes)
+    )
+
+
+# ---- Files
+
+
+@pytest.mark.parametrize("pieces", [7, 1000, 100_000])
+def test_what_is_written_is_read_back(tmp_path, monkeypatch, pieces):
+    monkeypatch.setattr(dataset, "ROWS", 1024)
+    events, pictures = random_events(5000), random_pictures([0, 20_000, 500_000, 2_000_000])
+    path = tmp_path / "a.h5"
+    write_sequence(path, in_pieces(events, pieces), iter(pictures), height=HEIGHT, width=WIDTH)
+    recording = open_recording(path)
+    assert (recording.height, recording.width, recording.count) == (HEIGHT, WIDTH, 5000)
+    read = concatenate(list(recording.events()))
+    for name in "txyp":
+        np.testing.assert_array_equal(getattr(read, name), getattr(events, name))
+    np.testing.assert_array_equal(recording.frames.times, [p.time for p in pictures])
+    for i, picture in enumerate(pictures):
+        np.testing.assert_array_equal(recording.frames.read(i), picture.image)
+
+
+def test_the_layout_is_that_of_event_cnn_minimal(tmp_path):
+    """Read as a program would that knows only the layout (SEMANTICS 7)."""
+    events, pictures = random_events(500), random_pictures([0, 300_000, 600_000])
+    path = tmp_path / "a.h5"
+    write_sequence(path, [events], pictures, height=HEIGHT, width=WIDTH, source="esim")
+    with h5py.File(path) as file:
+        columns = {name: file[f"events/{name}"] for name in ("xs", "ys", "ts", "ps")}
+        dtypes = [column.dtype for column in columns.values()]
+        assert dtypes == [np.int16, np.int16, np.float64, bool]
+        assert all(c.compression == "gzip" and c.shuffle for c in columns.values())
+        np.testing.assert_allclose(columns["ts"][:], events.t * 1e-6, rtol=1e-12)
+        assert list(file["images"]) == [f"image{i:09d}" for i in range(3)]
+        assert list(file["flow"]) == [f"flow{i:09d}" for i in range(3)]
+        for i, picture in enumerate(pictures):
+            image, flow = file[f"images/image{i:09d}"], file[f"flow/flow{i:09d}"]
+            assert image.dtype == np.uint8 and tuple(image.attrs["size"]) == (HEIGHT, WIDTH)
+            assert image.attrs["timestamp"] == flow.attrs["timestamp"] == 1e-6 * picture.time
+            # the first event that is not before the picture
+            assert image.attrs["event_idx"] == (events.t < picture.time).sum()
+            assert flow.shape == (2, HEIGHT, WIDTH) and flow.dtype == np.float32
+            np.testing.assert_array_equal(flow[:], picture.flow)
+        facts = file.attrs
+        assert tuple(facts["sensor_resolution"]) == (HEIGHT, WIDTH)
+        assert facts["num_events"] == 500 and facts["num_pos"] == events.p.sum()
+        assert facts["num_neg"] == 500 - events.p.sum()
+        assert facts["num_imgs"] == facts["num_flow"] == 3 and facts["source"] == "esim"
+        assert facts["t0"] == pytest.approx(1e-6 * events.t[0], abs=1e-9)
+        assert facts["tk"] == pytest.approx(1e-6 * events.t[-1], abs=1e-9)
+        assert facts["duration"] == pytest.approx(facts["tk"] - facts["t0"])
+
+
+def test_nothing_is_left_of_a_file_that_fails(tmp_path):
+    def events():
+        yield random_events(100)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_sequence(tmp_path / "a.h5", events(), [], height=HEIGHT, width=WIDTH)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_is_one_sentence(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(h5py.Dataset, "resize", full)
+    with pytest.raises(OutputError, match="a.h5: cannot write .No space left.*make room"):
+        write_sequence(tmp_path / "a.h5", [random_events(9)], [], height=HEIGHT, width=WIDTH)
+    assert not list(tmp_path.iterdir())
+
+
+def test_rounded_flow_is_near_and_compresses():
+    rng = np.random.default_rng(0)
+    for size in (1e-3, 1.0, 700.0):
+        flow = (size * rng.normal(size=(2, 30, 40))).astype(np.float32)
+        rounded = rounded_flow(flow)
+        assert rounded.dtype == np.float32
+        assert np.abs(rounded - flow).max() <= np.abs(flow).max() / 2048
+        assert not (rounded.view(np.int32) & 0xFFF).any()  # the low bits are 0
+    for flow in (np.zeros((2, 3, 4), np.float32), np.full((2, 3, 4), np.inf, np.float32)):
+        np.testing.assert_array_equal(rounded_flow(flow), flow)
+
+
+# ---- Sequences
+
+
+def test_a_folder_of_sequences_and_what_they_hold(tmp_path, capsys):
+    files = run(settings(tmp_path / "set"))
+    assert "2 sequences for training and 1 for validation" in capsys.readouterr().out
+    names = ["train/000000.h5", "train/000001.h5", "validation/000000.h5"]
+    assert [str(path.relative_to(tmp_path / "set")) for path in files] == names
+    found = sorted(str(p.relative_to(tmp_path / "set")) for p in tmp_path.rglob("*.h5"))
+    assert found == names
+    for path in files:
+        recording = open_recording(path)
+        assert (recording.height, recording.width) == (HEIGHT, WIDTH)
+        np.testing.assert_array_equal(recording.frames.times, np.arange(11) * 20_000)
+        events = concatenate(list(recording.events()))
+        assert len(events) > 100 and 0 <= events.t[0] and events.t[-1] <= 200_000
+        made = json.loads(contents(path)[1]["/"]["settings"])
+        assert made["seed"] == 0 and made["number"] == int(path.stem)
+        assert made["part"] == path.parent.name and made["scene"]["speed"] == [20.0, 100.0]
+    assert not same(files[0], files[1]) and not same(files[0], files[2])
+
+
+def test_flow_times_the_period_warps_each_picture_onto_the_next(tmp_path):
+    waves = np.stack([0.5 + 0.4 * np.sin(np.arange(64) / k) for k in (7.0, 8.0, 9.0, 10.0)])
+    smooth = (waves[:, :, None] * waves[:, None, :]).astype(np.float32)
+    chosen = settings(tmp_path)
+    for seed in range(3):
+        _, pictures = dataset.sequence(
+            jax.random.key(seed), smooth, chosen, chosen.sensor, HEIGHT, WIDTH
+        )
+        pictures, moved = list(pictures), 0
+        for last, now in zip(pictures, pictures[1:], strict=False):
+            displacement = np.moveaxis(now.flow / 50, 0, -1)
+            moved = max(moved, np.abs(displacement).max())
+            warped, inside = warp(last.image.astype(np.float32) / 255, displacement)
+            errors = np.abs(np.asarray(warped) - now.image / 255)[np.asarray(inside)]
+            assert np.median(errors) < 0.006  # edges of objects apart
+        assert moved > 0.3
+
+
+def test_the_same_seed_gives_the_same_and_each_sequence_stands_alone(tmp_path):
+    run(settings(tmp_path / "a"))
+    run(settings(tmp_path / "b", sequences=2))  # fewer: the others are the same
+    run(settings(tmp_path / "c", seed=1, sequences=1, validation=0))
+    for name in ("train/000000.h5", "validation/000000.h5"):
+        assert same(tmp_path / "a" / name, tmp_path / "b" / name)
+    assert not same(tmp_path / "a/train/000000.h5", tmp_path / "c/train/000000.h5")
+
+
+class Interrupted(BaseException):
+    pass
+
+
+def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, monkeypatch):
+    run(settings(tmp_path / "whole"))
+    real, calls = dataset._gathered, []
+
+    def gathered(events):
+        calls.append(1)
+        for part in real(events):
+            if len(calls) == 2:
+                raise Interrupted
+            yield part
+
+    folder = tmp_path / "part"
+    monkeypatch.setattr(dataset, "_gathered", gathered)
+    with pytest.raises(Interrupted):
+        run(settings(folder))
+    monkeypatch.setattr(dataset, "_gathered", real)
+    assert [p.name for p in folder.rglob("*.h5")] == ["000000.h5"]
+    first = (folder / "train/000000.h5").stat()
+    (folder / "train/000001.partial.h5").write_bytes(b"of a run that was killed")
+    run(settings(folder))
+    assert (folder / "train/000000.h5").stat().st_mtime_ns == first.st_mtime_ns
+    assert not list(folder.rglob("*.partial*"))
+    for name in ("train/000000.h5", "train/000001.h5", "validation/000000.h5"):
+        assert same(folder / name, tmp_path / "whole" / name)
+
+
+def test_a_run_with_more_sequences_adds_the_others(tmp_path, capsys):
+    run(settings(tmp_path, sequences=1, validation=0))
+    run(settings(tmp_path, sequences=3, validation=1))
+    assert "2 are new" in capsys.readouterr().out.splitlines()[-1]
+
+
+def test_one_in_twenty_is_for_validation(tmp_path, monkeypatch):
+    """950 and 50 as in the paper; more sequences take none from one part to the other."""
+    monkeypatch.setattr(dataset, "write_sequence", lambda path, *_, **__: path.touch() or 0)
+    monkeypatch.setattr(dataset, "sequence", lambda *_: ((), ()))
+    first = run(settings(tmp_path, sequences=100, validation=None))
+    more = run(settings(tmp_path, sequences=1000, validation=None))
+    parts = [path.parent.name for path in more]
+    assert (parts.count("train"), parts.count("validation")) == (950, 50)
+    assert set(first) < set(more) and len(first) == 100
+
+
+def test_faults_are_switched_on_but_options_stay():
+    chosen = dataset.with_faults(SensorSettings(mismatch=0.01, threshold=0.3))
+    assert (chosen.mismatch, chosen.threshold) == (0.01, 0.3)
+    assert (chosen.noise, chosen.leak, chosen.hot) == (FAULTY.noise, FAULTY.leak, FAULTY.hot)
+
+
+def test_a_disk_without_room_is_said_before_it_is_full(tmp_path, monkeypatch):
+    usage = dataset.shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(dataset.shutil, "disk_usage", lambda _: usage._replace(free=1000))
+    with pytest.raises(OutputError, match="needs about .* GB .*make room or ask for fewer"):
+        run(settings(tmp_path / "set"))
+
+
+# ---- Video files
+
+
+def ramp(path, count=20, fps=50):
+    """Columns whose intensity grows at different speeds, exponentially; lossless."""
+    rates = np.linspace(0, 3, WIDTH)  # log intensity per second
+    times = np.arange(count) / fps
+    logs = np.log(0.2) + times[:, None] * rates
+    pictures = np.round(255 * np.exp(logs)).astype(np.uint8)
+    pictures = np.repeat(pictures[:, None], HEIGHT, 1)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=fps)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "gray"
+        for number, picture in enumerate(pictures):
+            frame = av.VideoFrame.from_ndarray(picture, format="gray")
+            frame.pts = number
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return pictures
+
+
+def test_a_clip_becomes_the_events_of_its_log_intensity(tmp_path, capsys):
+    clip = tmp_path / "ramp.mkv"
+    pictures = ramp(clip)
+    out = tmp_path / "out.h5"
+    line = f"simulate -o {out} --video {clip} --threshold 0.2 --threshold-spread 0 --refractory 0"
+    assert cli.main(line.split()) == 0
+    recording = open_recording(out)
+    assert (recording.height, recording.width) == (HEIGHT, WIDTH)
+    np.testing.assert_allclose(recording.frames.times, np.arange(20) * 20_000, atol=500)
+    for i in (0, 7, 19):
+        np.testing.assert_array_equal(recording.frames.read(i), pictures[i])
+    events = concatenate(list(recording.events()))
+    assert events.p.all()
+    log = np.log(EPS + pictures[:, 0] / 255)
+    expected = np.floor((log[-1] - log[0]) / 0.2)
+    counts = np.zeros((HEIGHT, WIDTH), int)
+    np.add.at(counts, (events.y, events.x), 1)
+    np.testing.assert_array_equal(counts, np.tile(expected.astype(int), (HEIGHT, 1)))
+    assert expected.max() >= 5
+    # The first event of the fastest column lies where the log intensity, linear between the
+    # pictures, has grown by one threshold.
+    x = WIDTH - 1
+    first = events.t[events.x == x].min()
+    assert first == pytest.approx(np.interp(log[0, x] + 0.2, log[:, x], recording.frames.times),
+                                  abs=20)  # fmt: skip
+    with h5py.File(out) as file:
+        assert "flow" not in file and file.attrs["num_flow"] == 0
+    assert "events of 32x24 pixels" in capsys.readouterr().out
+    assert cli.main(line.split()) == 1  # exists
+    assert cli.main([*line.split(), "--overwrite", "--sensor-size", "16x12"]) == 0
+    assert open_recording(out).width == 16
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "gif"])
+def test_clips_of_common_formats_reach_from_black_to_white(tmp_path, suffix):
+    levels = [0, 30, 128, 200, 255]
+    pictures = [np.full((HEIGHT, WIDTH), level, np.uint8) for level in levels]
+    clip = tmp_path / f"levels.{suffix}"
+    write_video(clip, pictures, fps=10)
+    read = list(read_clip(clip))
+    np.testing.assert_allclose([p.image.mean() for p in read], levels, atol=3)
+    assert np.diff([p.time for p in read]) == pytest.approx(1e5)
+
+
+# ---- What is wrong
+
+
+def bad_lines(folder):
+    """(command line, what the message must contain)"""
+    (folder / "empty").mkdir()
+    (folder / "taken").mkdir()
+    (folder / "taken/letter.txt").write_text("mine")
+    (folder / "file").write_text("mine")
+    (folder / "clip.mp4").write_bytes(b"no video at all" * 50)
+    (folder / "damaged").mkdir()
+    (folder / "damaged/settings.json").write_text("{")
+    run(settings(folder / "other", sequences=1, validation=0))
+    with av.open(str(folder / "sound.wav"), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), "s16", "mono")
+        frame.sample_rate = 8000
+        container.mux(stream.encode(frame))
+    return [
+        ("-o taken", "is not empty"),
+        ("-o file", "choose another name"),
+        ("-o a.h5", "go into a folder"),
+        ("-o file/set", "cannot write there"),
+        ("-o damaged", "is damaged"),
+        ("-o other", "seconds was 0.2, now 2.0"),
+        ("-o out --video clip.mp4", "out.h5"),
+        ("-o out.h5 --video clip.mp4", "cannot be read as a video"),
+        ("-o out.h5 --video missing.mp4", "cannot be read as a video"),
+        ("-o out.h5 --video empty", "cannot be read as a video"),
+        ("-o out.h5 --video sound.wav", "holds no video"),
+    ]
+
+
+def test_everything_wrong_is_one_sentence(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    lines = bad_lines(tmp_path)
+    capsys.readouterr()
+    for line, expected in lines:
+        code = cli.main(["simulate", *line.split()])
+        error = capsys.readouterr().err
+        assert code == 1 and expected in error and error.count("\n") == 1, (line, error)
+    assert not list(tmp_path.rglob("*partial*")) and not (tmp_path / "out.h5").exists()
+    assert (tmp_path / "taken/letter.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    "line, expected",
+    [
+        ("-o new --seconds 0", "seconds is 0.0"),
+        ("-o new --seconds 3600", "make more sequences"),
+        ("-o new --fps 0", "fps is 0.0"),
+        ("-o new --sequences 0", "sequences is 0"),
+        ("-o new --validation 2000", "validation is 2000"),
+        ("-o new --sensor-size big", "sensor size 'big'"),
+    ],
+)
+def test_settings_that_cannot_be_are_said(capsys, line, expected):
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["simulate", *line.split()])
+    assert expected in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_folder_without_pictures_is_one_sentence(tmp_path, monkeypatch, capsys):
+    (tmp_path / "pictures").mkdir()
+    with monkeypatch.context() as patch:
+        patch.setattr(dataset, "load_textures", load_textures)
+        for name in ("pictures", "missing"):
+            line = ["simulate", "-o", str(tmp_path / "set"), "--images", str(tmp_path / name)]
+            assert cli.main(line) == 1
+            assert name in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.h5"))
+    run(settings(tmp_path / "set", sequences=1, validation=0))  # nothing stands in the way
+
+
+def test_number_of_pictures_follows_the_duration(tmp_path):
+    chosen = settings(tmp_path, seconds=0.25, fps=30.0)
+    textures = dataset._textures(None, 0, 0, 0)
+    _, pictures = dataset.sequence(
+        jax.random.key(0), textures, chosen, chosen.sensor, HEIGHT, WIDTH
+    )
+    times = [picture.time for picture in pictures]
+    assert len(times) == math.floor(0.25 * 30) + 1 and times[:2] == [0, 33_333]

@@ -1,0 +1,396 @@
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from firenet_jax import scenes as module
+from firenet_jax.scenes import (
+    PROCEDURAL,
+    SceneSettings,
+    flow,
+    load_textures,
+    photographs,
+    random_scene,
+    render,
+    rendering_times,
+    speeds,
+    video,
+)
+from firenet_jax.warp import warp
+
+H, W = 48, 64
+SIZE = {"height": H, "width": W}
+SPEED, DURATION, MANY = 100.0, 1.0, 12
+SETTINGS = SceneSettings(objects=2, pause=0.5, hdr=0.3)
+
+
+def smooth_textures(count=6, size=96):
+    """Noise without anything finer than five pixels."""
+    rng = np.random.default_rng(0)
+    noise = gaussian_filter(rng.normal(size=(count, size, size)), (0, 3, 3), mode="mirror")
+    low, high = noise.min((1, 2), keepdims=True), noise.max((1, 2), keepdims=True)
+    return jnp.asarray((noise - low) / (high - low), jnp.float32)
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    """MANY scenes of two objects, as one batch."""
+
+    def draw(key):
+        return random_scene(
+            key, smooth_textures(), duration=DURATION, speed=SPEED, settings=SETTINGS, **SIZE
+        )
+
+    return jax.jit(jax.vmap(draw))(jax.random.split(jax.random.key(0), MANY))
+
+
+@pytest.fixture(scope="module")
+def still(scenes):
+    """The first scene without tilt, turn, objects and any motion."""
+    scene = of(scenes, 0)
+    places = scene.places.at[:, 3:].set(0.0)
+    camera = scene.camera._replace(amplitude=jnp.zeros((6, module.WAVES)))
+    motions = scene.motions._replace(amplitude=jnp.zeros_like(scene.motions.amplitude))
+    return scene._replace(
+        places=places,
+        camera=camera,
+        motions=motions,
+        outlines=tuple(jnp.full_like(outline, -9.0) for outline in scene.outlines),
+        pauses=jnp.zeros_like(scene.pauses).at[:, 2].set(0.01),
+    )
+
+
+def of(scenes, k):
+    return jax.tree.map(lambda leaf: leaf[k], scenes)
+
+
+def moving(still, coordinate, amplitude):
+    """The still scene under a camera of which one coordinate is amplitude sin(t)."""
+    zeros = jnp.zeros((6, module.WAVES))
+    camera = module.Motion(
+        amplitude=zeros.at[coordinate, 0].set(amplitude),
+        frequency=jnp.ones_like(zeros),
+        phase=zeros,
+        pace=jnp.ones(()),
+    )
+    return still._replace(camera=camera)
+
+
+draw = jax.jit(jax.vmap(lambda scene, t: render(scene, t, **SIZE)))
+move = jax.jit(jax.vmap(lambda scene, t0, t1: flow(scene, t0, t1, **SIZE)))
+pace = jax.jit(jax.vmap(lambda scene, t: speeds(scene, t, **SIZE)))
+
+
+def at(scenes, t):
+    return jax.tree.map(np.asarray, draw(scenes, jnp.full(MANY, t)))
+
+
+# ---- Pictures
+
+
+def test_pictures_are_finite_and_in_range(scenes):
+    for t in (0.0, 0.4, 1.0):
+        rendering = at(scenes, t)
+        assert rendering.image.shape == rendering.plane.shape == (MANY, H, W)
+        assert rendering.image.dtype == np.float32
+        assert rendering.image.min() >= 0 and rendering.image.max() <= 1
+        assert set(np.unique(rendering.plane)) == {0, 1, 2}
+    shown = {tuple(np.unique(plane)) for plane in rendering.plane}
+    assert (0,) in shown and len(shown) >= 3  # some scenes have no object, some all
+    assert rendering.image.std((1, 2)).min() > 0.005
+
+
+def test_the_same_key_gives_the_same_scene_another_key_another(scenes):
+    first, second = at(scenes, 0.3).image[:2]
+    again = np.asarray(draw(scenes, jnp.full(MANY, 0.3)).image[0])
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - second).mean() > 0.02
+
+
+def test_objects_end_inside_their_outline():
+    """Beyond its field an outline goes on as at the border: a positive value there is a streak."""
+    outlines = jax.vmap(module._outline)(jax.random.split(jax.random.key(2), 300))
+    border = np.ones(outlines.shape[1:], bool)
+    border[1:-1, 1:-1] = False
+    assert outlines[:, border].max() < -0.02
+    area = (np.asarray(outlines) > 0).mean((1, 2))
+    assert area.min() > 0.03 and area.max() < 0.7 and area.std() > 0.06
+
+
+def test_hdr_scenes_span_more_than_others():
+    """Light and shadow: the darkest tenth is a hundredth as bright, or a tenth at least."""
+    textures = 0.2 + 0.8 * smooth_textures()[:2]
+    plain, hdr = (
+        module._lit(jax.random.key(1), textures, SceneSettings(hdr=hdr, black=(0.0, 0.0)))
+        for hdr in (0.0, 1.0)
+    )
+    ranges = [np.divide(*np.percentile(lit, [95, 5])) for lit in (plain, hdr)]
+    assert ranges[1] > 5 * ranges[0] and hdr.max() > 0.7 * plain.max()
+
+
+def test_textures_are_blurred_for_the_scale_at_which_they_are_seen():
+    """White noise: next to nothing may be left of what would alias, much of what would not."""
+    noise = jnp.asarray(np.random.default_rng(1).random((64, 64)), jnp.float32)
+    density = 2.0  # texture pixels for one of the image, which then holds up to 0.25 cycles each
+    spectrum = np.abs(np.fft.fft2(module._blurred(noise, jnp.float32(0.6 * density)) - 0.5)) ** 2
+    before = np.abs(np.fft.fft2(noise - 0.5)) ** 2
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(64), np.fft.fftfreq(64)))
+    aliasing, kept = frequency > 0.35, frequency < 0.1
+    assert spectrum[aliasing].sum() < 0.01 * before[aliasing].sum()
+    assert spectrum[kept].sum() > 0.6 * before[kept].sum()
+
+
+def test_a_magnified_texture_is_looked_up_as_numpy_would(still):
+    """A plane that faces the camera, its texture a ramp, one texture pixel in two of the image."""
+    size = still.textures[0].shape[-1]
+    ramp = jnp.broadcast_to(jnp.arange(size) / size, (size, size)).astype(jnp.float32)
+    scene = still._replace(
+        textures=(ramp,) * 3, density=jnp.full(3, 0.5), origin=jnp.full((3, 2), (size - 1) / 2)
+    )
+    x = np.arange(W) - (W - 1) / 2
+    expected = ((size - 1) / 2 + 0.5 * x) / size
+    image = render(scene, 0.0, **SIZE).image
+    np.testing.assert_allclose(image, np.broadcast_to(expected, (H, W)), atol=1e-5)
+
+
+def test_textures_go_on_mirrored(still):
+    size = still.textures[0].shape[-1]
+    ramp = jnp.broadcast_to(jnp.arange(size) / size, (size, size)).astype(jnp.float32)
+    scene = still._replace(
+        textures=(ramp,) * 3,
+        density=jnp.full(3, 1.0),
+        origin=jnp.zeros((3, 2)) + (W - 1) / 2 - 20.0,
+    )
+    row = np.asarray(render(scene, 0.0, **SIZE).image)[0]
+    expected = np.abs(np.arange(W) - 20.0) / size  # texture 0 lies at column 20
+    np.testing.assert_allclose(row, expected, atol=1e-5)
+
+
+# ---- Motion and flow
+
+
+def test_the_past_warped_by_the_flow_is_the_present(scenes):
+    """The exact flow, so only interpolation differs; occlusions and their rims do not count."""
+    for t0, t1 in [(0.1, 0.12), (0.5, 0.53), (0.9, 0.91)]:
+        before, after = at(scenes, t0), at(scenes, t1)
+        displacement, visible = move(scenes, jnp.full(MANY, t0), jnp.full(MANY, t1))
+        warped, inside = warp(jnp.asarray(before.image), displacement)
+        visible = np.asarray(visible)
+        assert not (visible & ~np.asarray(inside)).any()
+        error = np.abs(warped - after.image)
+        assert error[visible].mean() <= 0.004 and error[visible].max() <= 0.1
+        assert visible.mean() > 0.8
+        # What is invisible inside the picture is worse by far: the mask marks what it must.
+        assert error[~visible].mean() > 3 * error[visible].mean()
+
+
+def test_where_it_is_visible_the_same_plane_was_in_front(scenes):
+    before, after = at(scenes, 0.2), at(scenes, 0.23)
+    displacement, visible = move(scenes, jnp.full(MANY, 0.2), jnp.full(MANY, 0.23))
+    x = np.arange(W)[None, None] - displacement[..., 0]
+    y = np.arange(H)[None, :, None] - displacement[..., 1]
+    visible = np.asarray(visible)
+    column = np.clip(np.round(x), 0, W - 1).astype(int)
+    row = np.clip(np.round(y), 0, H - 1).astype(int)
+    then = np.take_along_axis(
+        before.plane.reshape(MANY, -1), (row * W + column).reshape(MANY, -1), 1
+    )
+    same = then.reshape(MANY, H, W) == after.plane
+    assert same[visible].all()
+    hidden = ~same & (x >= 0) & (x <= W - 1) & (y >= 0) & (y <= H - 1)
+    assert hidden.sum() > 100 and not visible[hidden].any()
+
+
+def test_between_equal_times_nothing_moves(scenes):
+    displacement, visible = move(scenes, jnp.full(MANY, 0.4), jnp.full(MANY, 0.4))
+    np.testing.assert_allclose(displacement, 0, atol=2e-3)
+    without = np.asarray(at(scenes, 0.4).plane.max((1, 2)) == 0)
+    assert without.any() and np.asarray(visible)[without, 1:-1, 1:-1].all()
+
+
+@pytest.mark.parametrize("coordinate, direction", [(0, [-1, 0]), (1, [0, -1])])
+def test_a_camera_that_moves_sideways_moves_the_picture_against_it(still, coordinate, direction):
+    """Lengths are pixels of the background at rest: 5 sin(t) to the right shifts it to the left."""
+    scene = moving(still, coordinate, 5.0)
+    displacement, visible = flow(scene, 0.1, 0.3, **SIZE)
+    expected = 5.0 * (math.sin(0.3) - math.sin(0.1)) * np.array(direction)
+    np.testing.assert_allclose(displacement, np.broadcast_to(expected, (H, W, 2)), atol=1e-4)
+    assert np.asarray(visible).mean() > 0.9
+
+
+def test_a_camera_that_moves_forward_spreads_the_picture(still):
+    focal = float(still.focal)
+    scene = moving(still, 2, 0.2 * focal)
+    displacement, _ = flow(scene, 0.0, 0.5, **SIZE)
+    closer = 1 - 0.2 * math.sin(0.5)  # so many parts of the distance are left
+    x = np.arange(W) - (W - 1) / 2
+    expected = np.broadcast_to(x * (1 - closer), (H, W))
+    np.testing.assert_allclose(displacement[..., 0], expected, atol=1e-4)
+
+
+def test_a_camera_that_rolls_turns_the_picture(still):
+    scene = moving(still, 5, 0.3)
+    displacement, _ = flow(scene, 0.0, 0.8, **SIZE)
+    angle = 0.3 * math.sin(0.8)  # about the axis that points into the scene, x towards y
+    x, y = np.meshgrid(np.arange(W) - (W - 1) / 2, np.arange(H) - (H - 1) / 2)
+    x0 = math.cos(angle) * x + math.sin(angle) * y
+    y0 = -math.sin(angle) * x + math.cos(angle) * y
+    np.testing.assert_allclose(displacement, np.stack([x - x0, y - y0], -1), atol=2e-4)
+
+
+def test_no_point_is_faster_than_said(scenes):
+    times = np.linspace(0, DURATION, 60).astype(np.float32)
+    measured = pace(scenes, jnp.broadcast_to(times, (MANY, 60)))
+    assert (np.asarray(scenes.speed) <= SPEED * 1.001).all()
+    assert (np.asarray(scenes.speed) > 0.7 * SPEED).all()
+    assert (measured.max(1) <= scenes.speed).all()
+    step = 2e-3
+    for k in range(0, 60, 10):
+        ends = jnp.full(MANY, times[k]), jnp.full(MANY, times[k] + step)
+        displacement, visible = move(scenes, *ends)
+        seen = jnp.where(visible, jnp.linalg.norm(displacement, axis=-1), 0.0).max((1, 2)) / step
+        both = jnp.stack(list(ends), 1)
+        assert (seen <= 1.05 * pace(scenes, both).max(1) + 1.0).all()
+
+
+def test_motion_is_smooth_and_pauses_stand_still(scenes):
+    times = jnp.linspace(0.0, DURATION, 401)
+    clock = jax.vmap(jax.vmap(module._clock, (None, 0)), (0, None))(scenes.pauses, times)
+    rate = np.diff(clock, axis=1) / np.diff(times)
+    assert rate.min() > -1e-3 and rate.max() < 1 + 1e-3
+    assert np.abs(np.diff(rate, axis=1)).max() < 0.25  # no jump of speed
+    stopped = (np.abs(rate) < 1e-3).any(1)
+    assert 0 < stopped.sum() < MANY  # half of the halves pause
+    k = int(np.argmax(stopped))
+    start, end, ramp = np.asarray(scenes.pauses[k][np.argmax(np.ptp(scenes.pauses[k, :, :2], 1))])
+    a, b = jnp.full(MANY, start + ramp), jnp.full(MANY, end)
+    np.testing.assert_allclose(move(scenes, a, b)[0][k], 0, atol=2e-3)
+    assert pace(scenes, jnp.stack([a, b], 1))[k].max() < 1
+
+
+def test_speeds_are_drawn_log_uniformly():
+    settings = SceneSettings(objects=0, speed=(3.0, 1000.0))
+    textures = jnp.zeros((1, 8, 8))
+    keys = jax.random.split(jax.random.key(5), 200)
+    made = jax.jit(
+        jax.vmap(lambda key: random_scene(key, textures, settings=settings, **SIZE).speed)
+    )(keys)
+    logs = np.log(np.asarray(made))
+    low, high = math.log(3), math.log(1000)
+    assert logs.max() <= high + 1e-3 and logs.min() < low + 0.3
+    assert abs(logs.mean() - (low + high) / 2) < 0.4 and abs(logs.std() - 1.68) < 0.25
+
+
+def test_another_key_does_not_retrace():
+    random_scene.clear_cache()
+    textures = jnp.zeros((1, 8, 8))
+    settings = SceneSettings(objects=0)
+    for seed in range(3):
+        scene = random_scene(jax.random.key(seed), textures, settings=settings, **SIZE)
+    assert random_scene._cache_size() == 1
+    for function, times in [(render, (0.1,)), (flow, (0.1, 0.2))]:
+        function.clear_cache()
+        for shift in (0.0, 0.3):
+            function(scene, *(t + shift for t in times), **SIZE)
+        assert function._cache_size() == 1
+
+
+def test_rendering_times_are_dense_enough_and_hold_the_bounds(scenes):
+    bounds = np.array([100_000, 133_333, 250_000, 250_001])
+    for k in (0, 1):
+        scene = of(scenes, k)
+        times = rendering_times(scene, bounds, longest=8000, **SIZE)
+        assert times.dtype == np.int64 and np.isin(bounds, times).all()
+        gaps = np.diff(times)
+        assert gaps.min() >= 1 and gaps.max() <= 8001
+        assert len(times) <= 0.15 * SPEED / 0.5 * 1.3 + 0.15 / 8e-3 + 8
+        for t0, t1 in zip(times[:-1:3], times[1::3], strict=False):
+            displacement, visible = flow(scene, 1e-6 * t0, 1e-6 * t1, **SIZE)
+            assert np.linalg.norm(displacement, axis=-1)[visible].max() <= 0.5
+
+
+def test_video_gives_each_time_its_picture(scenes):
+    times = np.array([0, 10, 20_000, 30_000, 1_000_000])
+    frames = list(video(of(scenes, 3), times, chunk=2, **SIZE))
+    assert [t for t, _ in frames] == times.tolist()
+    for t, image in frames:
+        expected = render(of(scenes, 3), 1e-6 * t, **SIZE).image
+        np.testing.assert_allclose(image, expected, atol=1e-4)
+
+
+# ---- Textures
+
+
+def test_wheel_photographs_are_there():
+    assert len(photographs()) >= 10
+
+
+def test_textures_without_a_folder():
+    textures = load_textures(count=12, size=64, seed=3)
+    assert textures.shape == (12, 64, 64) and textures.dtype == np.float32
+    assert textures.min() >= 0 and textures.max() <= 1 and textures.std((1, 2)).min() > 0.01
+    np.testing.assert_array_equal(textures, load_textures(count=12, size=64, seed=3))
+    assert np.abs(textures - load_textures(count=12, size=64, seed=4)).mean() > 0.05
+
+
+@pytest.mark.parametrize("kind", PROCEDURAL)
+def test_procedural_textures(kind):
+    made = [PROCEDURAL[kind](np.random.default_rng(seed), 80) for seed in (0, 0, 1)]
+    for texture in made:
+        assert texture.shape == (80, 80) and texture.min() >= 0 and texture.max() <= 1
+        assert texture.std() > 0.03
+    np.testing.assert_array_equal(made[0], made[1])
+    assert np.abs(made[0] - made[2]).mean() > 0.03
+
+
+def picture(path, height=90, width=120, mode="RGB"):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(len(str(path)))
+    shape = (height, width) if mode == "L" else (height, width, 3)
+    Image.fromarray(rng.integers(0, 256, shape, np.uint8)).save(path)
+
+
+def test_a_folder_of_pictures_with_subfolders(tmp_path):
+    picture(tmp_path / "a.png")
+    picture(tmp_path / "deep" / "b.JPG", mode="L")
+    (tmp_path / "notes.txt").write_text("no picture")
+    textures = load_textures(tmp_path, count=5, size=64)
+    assert textures.shape == (5, 64, 64)
+    # both pictures come before either comes again
+    assert load_textures(tmp_path, count=2, size=64, seed=9).shape == (2, 64, 64)
+
+
+def test_only_as_many_pictures_are_opened_as_are_asked_for(tmp_path, monkeypatch):
+    for k in range(30):
+        picture(tmp_path / f"{k}.png")
+    opened = []
+    monkeypatch.setattr(
+        module, "_cutting", lambda rng, path, size: opened.append(path) or np.zeros((size, size))
+    )
+    load_textures(tmp_path, count=4, size=64)
+    assert len(opened) == 4 == len(set(opened))
+
+
+def test_bad_pictures_are_named_and_left_out(tmp_path, caplog):
+    picture(tmp_path / "good.png")
+    picture(tmp_path / "small.png", 20, 200)
+    (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff no picture")
+    whole = (tmp_path / "good.png").read_bytes()
+    (tmp_path / "cut.png").write_bytes(whole[: len(whole) // 2])
+    assert load_textures(tmp_path, count=8, size=64).shape == (8, 64, 64)
+    for name in ("small.png", "broken.jpg", "cut.png"):
+        assert name in caplog.text
+
+
+def test_folders_that_cannot_be_used(tmp_path):
+    with pytest.raises(ValueError, match="no such folder"):
+        load_textures(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match="holds no pictures"):
+        load_textures(tmp_path)
+    picture(tmp_path / "small.png", 20, 30)
+    with pytest.raises(ValueError, match="30x20 is too small"):
+        load_textures(tmp_path, size=64)

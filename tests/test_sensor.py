@@ -1,0 +1,477 @@
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from firenet_jax import sensor as module
+from firenet_jax.events import Events, concatenate
+from firenet_jax.network import initial_state
+from firenet_jax.reconstruction import reconstruct
+from firenet_jax.scenes import SceneSettings, load_textures, random_scene, rendering_times, video
+from firenet_jax.sensor import (
+    EPS,
+    FAULTY,
+    LONGEST,
+    Sensor,
+    SensorSettings,
+    event_list,
+    random_sensor,
+    sequences,
+    simulate,
+)
+from firenet_jax.tensors import pack, voxelise
+
+H, W = 12, 14
+
+
+def plain_sensor(on=0.2, off=0.17, refractory=0.0):
+    """Every fault off; thresholds may be arrays (H, W)."""
+    return Sensor(
+        on=jnp.asarray(on, jnp.float32),
+        off=jnp.asarray(off, jnp.float32),
+        refractory=jnp.int32(refractory * 1e6 * 1024) if refractory else None,
+        drift=None,
+        noise=None,
+        cutoff=None,
+        phase=None,
+        key=jax.random.key(0),
+    )
+
+
+def listed(sensor, times, logs):
+    """Log intensities (n, H, W), float64 -> all events."""
+    images = (np.exp(logs) - EPS).astype(np.float32)
+    chunks = list(event_list(sensor, zip(times, images, strict=True)))
+    return concatenate(chunks) if chunks else Events.empty()
+
+
+def random_logs(seed, times):
+    """A few waves of each pixel between log(0.001) and log(1.001), (n, H, W)."""
+    rng = np.random.default_rng(seed)
+    wave = rng.uniform(10, 150, (H, W, 3))
+    phase, size = rng.uniform(0, 6, (H, W, 3)), rng.uniform(0, 1, (H, W, 3))
+    seconds = 1e-6 * np.asarray(times)[:, None, None, None]
+    logs = -3.0 + (size * np.sin(wave * seconds + phase)).sum(-1)
+    return np.clip(logs, np.log(1.1 * EPS), 0.0)
+
+
+def esim_pixel(times, logs, on, off, refractory=0.0):
+    """ESIM as it stands, one crossing after the other: [(time, p)], float64 microseconds."""
+    reference, last, events = logs[0], -np.inf, []
+    for k in range(1, len(times)):
+        before, after, start = logs[k - 1], logs[k], times[k - 1]
+        p, threshold = (1, on) if after > before else (-1, off)
+        while p * (after - reference) >= threshold:
+            reference += p * threshold
+            t = start + (reference - before) / (after - before) * (times[k] - start)
+            if t - last >= refractory:
+                events.append((t, p))
+                last = t
+    return events
+
+
+def at_pixel(events, y, x):
+    here = (events.y == y) & (events.x == x)
+    return events.t[here], np.where(events.p[here], 1, -1)
+
+
+# ---- Event lists
+
+
+@pytest.mark.parametrize("refractory", [0.0, 1e-3, 7e-3])
+def test_equals_the_loop_over_single_crossings(refractory):
+    """Every event of every pixel, to the microsecond; the intervals are of any length."""
+    rng = np.random.default_rng(1)
+    times = np.cumsum(rng.integers(1, 9000, 60))
+    logs = random_logs(2, times)
+    images = (np.exp(logs) - EPS).astype(np.float32)
+    events = listed(plain_sensor(refractory=refractory), times, logs)
+    assert np.all(np.diff(events.t) >= 0) and len(events) > 2000
+    on, off = float(np.float32(0.2)), float(np.float32(0.17))
+    seen = np.log(EPS + images.astype(np.float64))
+    total = 0
+    for y in range(H):
+        for x in range(W):
+            expected = esim_pixel(times, seen[:, y, x], on, off, 1e6 * refractory)
+            t, p = at_pixel(events, y, x)
+            assert p.tolist() == [p for _, p in expected]
+            np.testing.assert_allclose(t, [t for t, _ in expected], atol=1.01)
+            total += len(expected)
+    assert total == len(events)
+
+
+def crossings(log, turns, end, on, off):
+    """Analytic crossings of log(t) between its turning points, in seconds."""
+    reference, events = log(0.0), []
+    for start, stop in zip([0.0, *turns], [*turns, end], strict=True):
+        p, threshold = (1, on) if log(stop) > log(start) else (-1, off)
+        while p * (log(stop) - reference) >= threshold:
+            reference += p * threshold
+            level = reference
+            events.append((brentq(lambda t, level=level: log(t) - level, start, stop), p))
+    return events
+
+
+def test_times_are_those_of_the_analytic_crossings():
+    """Linear and sinusoidal log intensity, rendered every 0.1 ms: counts exact, times to 1 us.
+
+    Between two renderings L is taken as linear, off by at most h^2 / 8 max|L''|. At a tenth of
+    the greatest slope of a sinusoid of 4 Hz that is 0.3 us; rounding adds half a microsecond.
+    """
+    end, thresholds = 0.4, [(0.18, 0.18), (0.11, 0.23), (0.35, 0.15), (0.05, 0.061)]
+    times = np.arange(0, round(1e6 * end) + 1, 100)
+    shapes = []
+    for slope in (3.1, -4.3, 11.3, -0.93):
+        start = -6.0 if slope > 0 else -1.0
+        shapes.append((lambda t, a=start, b=slope: a + b * t, [], lambda t, b=slope: np.abs(b)))
+    for size, hertz, phase in [(1.5, 4.0, 0.3), (0.7, 3.1, 2.0), (2.4, 1.7, 4.0), (1.0, 4.0, 1.0)]:
+        w = 2 * np.pi * hertz
+        turns = [(np.pi / 2 + k * np.pi - phase) / w for k in range(-2, 20)]
+        shapes.append(
+            (
+                lambda t, a=size, w=w, f=phase: -2.8 + a * np.sin(w * t + f),
+                [t for t in turns if 0 < t < end],
+                lambda t, a=size, w=w, f=phase: np.abs(a * w * np.cos(w * t + f)) / (a * w),
+            )
+        )
+    logs = np.stack([shape(1e-6 * times) for shape, _, _ in shapes], -1)  # (n, shapes)
+    logs = np.broadcast_to(logs[:, None], (len(times), len(thresholds), len(shapes)))
+    on, off = np.array(thresholds).T
+    wide = np.ones((1, len(shapes)))
+    events = listed(plain_sensor(on[:, None] * wide, off[:, None] * wide), times, logs)
+    checked = 0
+    for y in range(len(thresholds)):
+        for x, (shape, turns, slope) in enumerate(shapes):
+            on, off = (float(np.float32(c)) for c in thresholds[y])
+            expected = crossings(shape, turns, end, on, off)
+            t, p = at_pixel(events, y, x)
+            assert p.tolist() == [p for _, p in expected], (y, x)
+            exact = np.array([t for t, _ in expected])
+            steep = slope(exact) * np.ones(len(exact)) >= 0.1
+            error = np.abs(t - 1e6 * exact)[steep]
+            assert error.max() <= 1.0, (y, x, error.max())
+            checked += steep.sum()
+    assert checked > 500
+
+
+def test_thresholds_summed_lead_from_the_first_log_intensity_to_the_last():
+    times = np.arange(0, 300_000, 2000)
+    logs = random_logs(3, times)
+    events = listed(plain_sensor(), times, logs)
+    level = logs[0].copy()
+    np.add.at(level, (events.y, events.x), np.where(events.p, 0.2, -0.17))
+    error = logs[-1] - level
+    assert error.max() < 0.2 + 1e-4 and error.min() > -0.17 - 1e-4
+
+
+def test_the_refractory_period_separates_events_and_moves_the_reference_all_the_same():
+    """A jump of 20 thresholds within 10 ms, then stillness, then back down slowly."""
+    times = np.array([0, 10_000, 60_000, 160_000])
+    levels = np.array([-5.0, -5.0 + 20.5 * 0.2, -5.0 + 20.5 * 0.2, -5.0])
+    logs = np.broadcast_to(levels[:, None, None], (4, 1, 1))
+    events = listed(plain_sensor(refractory=1e-3), times, logs)
+    assert np.diff(events.t).min() >= 999
+    rising = events.t[events.p]
+    # a crossing every 488 us: every third is 1 ms or more after the last one
+    assert len(rising) == 7 and set(np.diff(rising)) <= {1463, 1464}
+    # from 20 thresholds above: falls 4.1, of which the last of 0.17 is the 23rd
+    assert (~events.p).sum() == 23
+
+
+def test_events_of_an_interval_lie_in_it_and_all_are_sorted():
+    times = np.arange(500, 9000, 13)
+    images = (np.exp(random_logs(4, times)) - EPS).astype(np.float32)
+    chunks = list(event_list(plain_sensor(0.01, 0.01), zip(times, images, strict=True)))
+    for chunk in chunks:
+        start = times[np.searchsorted(times, chunk.t[0], "right") - 1]
+        assert chunk.t[-1] <= start + 13 or chunk.t[0] == start  # the end of the interval before
+    events = concatenate(chunks)
+    assert len(events) > 5000 and events.t.dtype == np.int64 and np.diff(events.t).min() == 0
+
+
+def test_times_that_do_not_advance_are_refused():
+    image = np.full((2, 2), 0.5, np.float32)
+    for second in (5, 4, 6 + LONGEST):
+        with pytest.raises(ValueError, match="renderings at 5"):
+            list(event_list(plain_sensor(), [(5, image), (second, image)]))
+
+
+def test_large_times_lose_no_microsecond():
+    """Two days into a recording the stamps are those of its beginning."""
+    times = np.arange(0, 100_000, 1000)
+    logs, later = random_logs(5, times), 2 * 86400 * 10**6
+    early, late = (listed(plain_sensor(), start + times, logs) for start in (0, later))
+    np.testing.assert_array_equal(late.t - later, early.t)
+    np.testing.assert_array_equal(late.p, early.p)
+
+
+# ---- Sensors and their faults
+
+
+def still(seconds, step=10_000):
+    times = np.arange(0, round(1e6 * seconds) + 1, step)
+    return times, np.full((len(times), H, W), -1.0)
+
+
+def test_thresholds_are_drawn_as_the_paper_says():
+    sensors = jax.vmap(lambda key: random_sensor(key, height=2, width=2))(
+        jax.random.split(jax.random.key(0), 2000)
+    )
+    for drawn in (np.asarray(sensors.on), np.asarray(sensors.off)):
+        assert drawn.shape == (2000,)
+        assert abs(drawn.mean() - 0.18) < 0.003 and abs(drawn.std() - 0.03) < 0.002
+    assert abs(np.corrcoef(sensors.on, sensors.off)[0, 1]) < 0.1
+    assert sensors.drift is None and sensors.noise is None and sensors.cutoff is None
+
+
+def test_wide_thresholds_and_mismatch():
+    settings = SensorSettings(threshold_range=(0.1, 1.7))
+    draw = jax.vmap(lambda key: random_sensor(key, height=2, width=2, settings=settings))
+    sensors = draw(jax.random.split(jax.random.key(1), 500))
+    assert 0.1 <= sensors.on.min() < 0.12 and 1.5 < sensors.on.max() <= 1.7
+    assert abs(np.std(sensors.off / sensors.on) - 0.1) < 0.02
+    own = random_sensor(
+        jax.random.key(2), height=80, width=90, settings=SensorSettings(mismatch=0.03)
+    )
+    assert own.on.shape == own.off.shape == (80, 90)
+    assert abs(np.std(own.on) - 0.03) < 0.001 and own.on.min() >= 0.01
+
+
+def test_a_still_scene_is_silent_without_faults():
+    assert len(listed(plain_sensor(), *still(1.0))) == 0
+
+
+def test_leaks_are_on_events_at_their_rate_and_not_all_at_once():
+    sensor = random_sensor(
+        jax.random.key(3), height=H, width=W, settings=SensorSettings(leak=(2.0, 2.0))
+    )
+    events = listed(sensor, *still(5.0))
+    assert events.p.all() and len(events) == pytest.approx(5 * 2 * H * W, rel=0.02)
+    counts = np.histogram(events.t, 20)[0]
+    assert counts.max() < 1.6 * counts.mean()
+
+
+def test_shot_noise_has_its_rate_no_order_and_both_polarities():
+    sensor = random_sensor(
+        jax.random.key(4), height=H, width=W, settings=SensorSettings(noise=(3.0, 3.0))
+    )
+    events = listed(sensor, *still(10.0))
+    expected = 10 * 3 * H * W  # 5040, standard deviation 71
+    assert abs(len(events) - expected) < 300
+    assert abs(events.p.mean() - 0.5) < 0.03
+    spread = np.histogram(events.t % 10_000, 10, (0, 10_000))[0]  # within the intervals
+    assert abs(spread / len(events) - 0.1).max() < 0.02
+    per_pixel = np.bincount(events.y * W + events.x, minlength=H * W)
+    assert per_pixel.var() == pytest.approx(per_pixel.mean(), rel=0.4)  # Poisson
+
+
+def test_hot_pixels_are_few_and_fire_all_the_time():
+    sensor = random_sensor(
+        jax.random.key(5), height=60, width=70, settings=SensorSettings(hot=(0.01, 0.01))
+    )
+    times = np.arange(0, 500_001, 10_000)
+    events = listed(sensor, times, np.full((len(times), 60, 70), -1.0))
+    counts = np.bincount(events.y.astype(int) * 70 + events.x, minlength=60 * 70)
+    assert 20 <= (counts > 0).sum() <= 70  # 42 expected
+    rates = counts[counts > 0] / 0.5
+    assert rates.min() >= 6 and rates.max() <= 502
+    assert 0 < events.p.mean() < 1
+
+
+def test_bandwidth_lets_slow_changes_pass_and_holds_fast_ones_back():
+    """A first-order low-pass of 100 Hz: a step's crossings come late, by its exponential."""
+    sensor = plain_sensor()._replace(cutoff=jnp.array([100.0, 1.0]))
+    times = np.arange(0, 30_000, 20)
+    logs = np.where(times > 0, -1.0, -3.0)[:, None, None]
+    events = listed(sensor, times, logs)
+    k = np.arange(1, 10)
+    tau = 1e6 / (2 * np.pi * 100)
+    expected = -tau * np.log1p(-k * 0.2 / 2.0)
+    np.testing.assert_allclose(events.t[:9], expected, atol=25)
+    # In the dark it is slower, where the setting says so.
+    dark = sensor._replace(cutoff=jnp.array([100.0, 0.1]))
+    assert listed(dark, times, logs).t[0] > 1.5 * events.t[0]
+
+
+def test_the_same_key_gives_the_same_events():
+    times = np.arange(0, 200_000, 5000)
+    logs = random_logs(6, times)
+    runs = []
+    for seed in (7, 7, 8):
+        sensor = random_sensor(jax.random.key(seed), height=H, width=W, settings=FAULTY)
+        runs.append(listed(sensor, times, logs))
+    for column in ("t", "x", "y", "p"):
+        np.testing.assert_array_equal(getattr(runs[0], column), getattr(runs[1], column))
+    assert len(runs[0]) != len(runs[2])
+
+
+# ---- Event tensors
+
+B, T, SIZE, RENDERINGS = 2, 6, 48, 5
+SQUARE = {"height": SIZE, "width": SIZE}
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    """A slow and a fast one, with an object each."""
+    textures = jnp.asarray(load_textures(None, 8, 64, seed=1))
+    settings = SceneSettings(objects=1, pause=0.0)
+
+    def draw(key, speed):
+        return random_scene(key, textures, duration=0.3, speed=speed, settings=settings, **SQUARE)
+
+    keys = jax.random.split(jax.random.key(3), B)
+    return jax.jit(jax.vmap(draw))(keys, jnp.array([60.0, 400.0]))
+
+
+@pytest.fixture(scope="module", params=["clean", "faulty"])
+def simulated(request, scenes):
+    """The scenes before two sensors, and all that made the events."""
+    settings = {"clean": SensorSettings(), "faulty": FAULTY}[request.param]
+    draw = jax.vmap(lambda key: random_sensor(key, settings=settings, **SQUARE))
+    sensors = draw(jax.random.split(jax.random.key(4), B))
+    window = (1e6 * 0.5 * RENDERINGS / scenes.speed).astype(jnp.int32)
+    bounds = 1000 + jnp.arange(T + 1, dtype=jnp.int32)[:, None] * window[None]
+    simulation = simulate(sensors, scenes, bounds, renderings=RENDERINGS, **SQUARE)[1]
+    return SimpleNamespace(sensors=sensors, bounds=bounds, simulation=simulation)
+
+
+def of_sequence(tree, b):
+    return jax.tree.map(lambda leaf: leaf[b], tree)
+
+
+def rendered_at(bounds):
+    """(T + 1,) -> the times at which `simulate` renders."""
+    inside = [
+        start + (np.arange(1, RENDERINGS + 1) * (stop - start)) // RENDERINGS
+        for start, stop in zip(bounds[:-1], bounds[1:], strict=True)
+    ]
+    return np.concatenate([bounds[:1], *inside])
+
+
+def windows_of(events, bounds):
+    cuts = np.searchsorted(events.t, bounds)
+    return [events.select(slice(*cut)) for cut in zip(cuts[:-1], cuts[1:], strict=True)]
+
+
+def test_event_lists_give_the_tensors_of_the_device(simulated, scenes):
+    """Same seed, two ways. What differs is the rounding of the picture itself: the compiler fuses
+    its coordinates differently, by 1e-5 pixels, and that can move a stamp by a microsecond."""
+    same = []
+    for b in range(B):
+        scene, sensor = (of_sequence(x, b) for x in (scenes, simulated.sensors))
+        bounds = np.asarray(simulated.bounds[:, b], np.int64)
+        frames = video(scene, rendered_at(bounds), **SQUARE)
+        events = concatenate(list(event_list(sensor, frames)))
+        rows = [[window] for window in windows_of(events, bounds)]
+        limits = np.stack([bounds[:-1], bounds[1:]], -1)[:, None]
+        tensors = voxelise(pack(rows, bounds=limits), **SQUARE)[:, 0]
+        error = np.abs(tensors - simulated.simulation.tensors[:, b]).max(-1)
+        same.append(error <= 1e-4)
+        # An event at a window's very end may be in another window, else all are in both.
+        microsecond = 4 / (bounds[1] - bounds[0])
+        assert np.mean(error < 3 * microsecond) >= 0.9995
+        assert len(events) > 0.05 * T * SIZE * SIZE
+    assert np.mean(same) >= 0.999
+
+
+def test_truth_belongs_to_the_windows_end(simulated, scenes):
+    for b in range(B):
+        frames = video(of_sequence(scenes, b), np.asarray(simulated.bounds[1:, b]), **SQUARE)
+        images = np.stack([image for _, image in frames])
+        np.testing.assert_allclose(images, simulated.simulation.images[:, b], atol=1e-4)
+
+
+def test_no_more_than_half_a_pixel_between_two_renderings(simulated):
+    length = np.linalg.norm(simulated.simulation.displacement, axis=-1)
+    assert 0.5 < length.max() <= 0.5 * RENDERINGS
+
+
+@pytest.mark.parametrize("simulated", ["faulty"], indirect=True)
+def test_simulation_goes_on_where_it_ended(simulated, scenes):
+    bounds, parts = simulated.bounds, []
+    first = [next(video(of_sequence(scenes, b), bounds[:1, b], **SQUARE))[1] for b in range(B)]
+    state = jax.vmap(module.first_state)(simulated.sensors, jnp.stack(first))
+    for part in (bounds[: T // 2 + 1], bounds[T // 2 :]):
+        state, made = simulate(
+            simulated.sensors, scenes, part, state, renderings=RENDERINGS, **SQUARE
+        )
+        parts.append(made.tensors)
+    error = jnp.abs(jnp.concatenate(parts) - simulated.simulation.tensors).max(-1)
+    assert (error <= 1e-4).mean() >= 0.999
+
+
+def test_denser_renderings_give_the_same_events(scenes):
+    """Half a pixel between renderings is dense enough: four times denser changes few events."""
+    counts = []
+    for pixels in (0.5, 0.125):
+        scene = of_sequence(scenes, 1)
+        times = rendering_times(scene, np.array([0, 50_000]), pixels=pixels, **SQUARE)
+        events = concatenate(list(event_list(plain_sensor(), video(scene, times, **SQUARE))))
+        counts.append(np.bincount(events.y.astype(int) * SIZE + events.x, minlength=SIZE**2))
+    assert counts[1].mean() > 0.3
+    assert np.abs(counts[0] - counts[1]).mean() < 0.05 * counts[1].mean()
+
+
+def test_the_runs_of_given_pictures_vote_as_their_events_do():
+    """The same pictures for both outputs: nothing but the stamps' last bits may differ."""
+    sensor = random_sensor(jax.random.key(9), height=H, width=W, settings=FAULTY)
+    times = np.array([0, 3000, 7001, 9000, 14_000])
+    images = (np.exp(random_logs(10, times)) - EPS).astype(np.float32)
+    state, planes = module.first_state(sensor, jnp.asarray(images[0])), jnp.zeros((5, 1, H, W))
+    one_step = jax.jit(module.step)
+    for k in range(1, len(times)):
+        duration = jnp.int32(times[k] - times[k - 1])
+        state, runs = one_step(sensor, state, jnp.asarray(images[k]), duration)
+        batch = jax.tree.map(lambda leaf: leaf[None], runs)
+        passed, total = jnp.array([times[k - 1]]), jnp.array([times[-1]])
+        planes = module._votes(planes, 0, batch, passed, total)
+    events = concatenate(list(event_list(sensor, zip(times, images, strict=True))))
+    tensor = voxelise(pack([[events]], bounds=np.array([[[0, times[-1]]]])), height=H, width=W)
+    np.testing.assert_allclose(planes[:, 0].transpose(1, 2, 0), tensor[0, 0], atol=2e-5)
+    assert int(state.renderings) == 4
+
+
+def test_random_sequences_have_the_declared_shapes_and_do_not_retrace():
+    textures = jnp.asarray(load_textures(None, 4, 32, seed=2, procedural=1.0))
+    settings = dict(batch=2, windows=3, height=20, width=24, renderings=4, motion=(0.5, 2.0))
+    settings |= dict(scene=SceneSettings(objects=0))
+    sequences.clear_cache()
+    for seed in range(2):
+        made = sequences(jax.random.key(seed), textures, **settings)
+    assert sequences._cache_size() == 1
+    assert made.tensors.shape == (3, 2, 20, 24, 5) and made.images.shape == (3, 2, 20, 24)
+    assert made.displacement.shape == (3, 2, 20, 24, 2) and made.visible.dtype == bool
+    for leaf in made:
+        assert np.isfinite(leaf).all()
+    assert made.images.min() >= 0 and made.images.max() <= 1
+    with pytest.raises(ValueError, match="6 renderings"):
+        sequences(jax.random.key(0), textures, **(settings | dict(motion=(1.0, 3.0))))
+
+
+@pytest.mark.slow
+@pytest.mark.reference
+def test_the_published_weights_reconstruct_simulated_photographs(reference):
+    from skimage.metrics import structural_similarity
+
+    from firenet_jax.checkpoint import convert
+
+    weights = convert(reference / "firenet_published.pth")
+    textures = jnp.asarray(load_textures(None, 64, 256, seed=0, procedural=0.0))
+    scores = []
+    for seed in range(20):
+        made = sequences(jax.random.key(seed), textures, batch=1, windows=10, height=160, width=160)
+        images = reconstruct(weights, initial_state(1, 160, 160), made.tensors)[1]
+        score = structural_similarity(
+            np.asarray(made.images[-1, 0]),
+            np.clip(images[-1, 0], 0, 1),
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+            data_range=1.0,
+        )
+        scores.append(score)
+    assert np.mean(scores) >= 0.65, np.round(scores, 2)
