@@ -73,16 +73,16 @@ def lists(textures, count: int, settings: SceneSettings) -> dict:
     low, high = (np.log(speed) for speed in settings.speed)
     rows, frames = [], np.arange(0, 2_000_001, 20_000)
 
-    def one(k, speed, until=len(frames)):
+    def one(k, speed):
         start = time.perf_counter()
         scene = random_scene(jax.random.key(k), textures, speed=speed, settings=settings, **size)
-        times = rendering_times(scene, frames[:until], **size)
+        times = rendering_times(scene, frames, **size)
         sensor = random_sensor(jax.random.key(k), **size)
         events = sum(len(part) for part in event_list(sensor, video(scene, times, **size)))
         return {"speed": speed, "renderings": len(times), "events": events,
                 "seconds": time.perf_counter() - start}  # fmt: skip
 
-    one(0, 10.0, until=3)  # compilation
+    one(0, float(np.exp(low)))  # compilation
     print(f"{'list, px/s':>34} {'renderings':>10} {'events':>10} {'seconds':>9}")
     for k in range(count):
         rows.append(one(k, float(np.exp(low + (k + 0.5) / count * (high - low)))))

@@ -85,7 +85,7 @@ class Scene(NamedTuple):
     textures: tuple[jax.Array, ...]  # K + 1 of (S, S) intensities, blurred for their scale
     density: jax.Array  # (K + 1,) texture pixels for each pixel in the world
     origin: jax.Array  # (K + 1, 2) texture coordinates of the plane's centre
-    outlines: tuple[jax.Array, ...]  # K of (OUTLINE, OUTLINE) radii from the edge, inside > 0
+    outlines: jax.Array  # (K, OUTLINE, OUTLINE) distance from the edge in radii, inside > 0
     radius: jax.Array  # (K, 2) in pixels in the world, and as seen at rest
     softness: jax.Array  # (K,) pixels over which the edge fades
     pauses: jax.Array  # (PAUSES, 3) seconds: start, end, and how long stopping takes
@@ -172,7 +172,7 @@ def random_scene(
         textures=tuple(canvases),
         density=1 / (zoom * depth),
         origin=origin,
-        outlines=tuple(outlines),
+        outlines=outlines,
         radius=jnp.stack([seen_radius * depth[1:], seen_radius], -1),
         softness=log_uniform(settings.softness, (settings.objects,)),
         pauses=pauses,
@@ -426,7 +426,7 @@ def speeds(scene: Scene, t: jax.Array, *, height: int, width: int) -> jax.Array:
     corners = jnp.array([-1.0, 0.0, 1.0])
     box_y, box_x = (grid.ravel() for grid in jnp.meshgrid(corners, corners, indexing="ij"))
     last_x, last_y = width - 1.0, height - 1.0
-    exists = jnp.stack([jnp.bool_(True), *(outline.max() > 0 for outline in scene.outlines)])
+    exists = jnp.append(True, scene.outlines.max((1, 2), initial=-1.0) > 0)
 
     def at(t):
         to_image = _to_image(scene, t, height, width)
@@ -472,12 +472,12 @@ def _colour(scene: Scene, k: int, u: jax.Array, v: jax.Array) -> jax.Array:
     return sample(scene.textures[k], u, v)
 
 
-def _inside(scene: Scene, k: int, u: jax.Array, v: jax.Array) -> jax.Array:
-    """Pixels from the edge of object k (from 1) at its coordinates, positive inside."""
-    radius, seen = scene.radius[k - 1]
+def _inside(outline: jax.Array, radii: jax.Array, u: jax.Array, v: jax.Array) -> jax.Array:
+    """Pixels from the edge of an object at its coordinates, positive inside."""
+    radius, seen = radii
     centre = (OUTLINE - 1) / 2
     cells = centre / (MARGIN * radius)
-    return seen * sample(scene.outlines[k - 1], centre + cells * u, centre + cells * v)
+    return seen * sample(outline, centre + cells * u, centre + cells * v)
 
 
 @partial(jax.jit, static_argnames=("height", "width"))
@@ -489,7 +489,7 @@ def render(scene: Scene, t: jax.Array, *, height: int, width: int) -> Rendering:
     plane = jnp.zeros((height, width), jnp.int32)
     for k in range(1, len(scene.textures)):  # from back to front
         u, v = _project(to_plane[k], x, y)
-        inside = _inside(scene, k, u, v)
+        inside = _inside(scene.outlines[k - 1], scene.radius[k - 1], u, v)
         cover = jnp.clip(0.5 + inside / scene.softness[k - 1], 0.0, 1.0)
         image = image + cover * (_colour(scene, k, u, v) - image)
         plane = jnp.where(inside >= 0, k, plane)
@@ -510,28 +510,34 @@ def flow(
     x, y = _grid(height, width)
     now, then = (_to_image(scene, t, height, width) for t in (t1, t0))
     now_to_plane, then_to_plane = _inverse(now), _inverse(then)
-    planes = len(scene.textures)
+    objects = range(1, len(scene.textures))
+
+    # Inside a loop of its own each distance is made once; elsewhere XLA looks the outlines up for
+    # each use, in a way that is ten times slower on a CPU.
+    def distances(to_plane, x, y):
+        def one(inputs):
+            return _inside(*inputs[:2], *_project(inputs[2], x, y))
+
+        return jax.lax.map(one, (scene.outlines, scene.radius, to_plane[1:]))
+
     # Where an edge has faded to a tenth, and the pixel more that bilinear interpolation reaches.
     edge = 1.0 + 0.4 * scene.softness
-
-    x0, y0 = _project(then[0], *_project(now_to_plane[0], x, y))
     front = jnp.zeros((height, width), jnp.int32)
-    visible = jnp.ones((height, width), bool)
-    for k in range(1, planes):
-        u, v = _project(now_to_plane[k], x, y)
-        inside = _inside(scene, k, u, v)
-        owned, mixed = inside >= 0, jnp.abs(inside) < edge[k - 1]
-        x0_k, y0_k = _project(then[k], u, v)
+    x0, y0 = _project(then[0], *_project(now_to_plane[0], x, y))
+    clear = jnp.full((height, width), jnp.inf)  # pixels from the nearest edge in sight
+    inside = distances(now_to_plane, x, y)
+    for k in objects:
+        owned = inside[k - 1] >= 0
+        x0_k, y0_k = _project(then[k], *_project(now_to_plane[k], x, y))
         x0, y0 = jnp.where(owned, x0_k, x0), jnp.where(owned, y0_k, y0)
         front = jnp.where(owned, k, front)
         # An object that covers a pixel wholly also covers the edges behind it.
-        visible = (visible | owned) & ~mixed
-    # Else XLA computes these anew for each of their uses.
-    x0, y0, front, visible = jax.lax.optimization_barrier((x0, y0, front, visible))
-    for k in range(1, planes):
-        u, v = _project(then_to_plane[k], x0, y0)
-        visible &= ~((front < k) & (_inside(scene, k, u, v) > -edge[k - 1]))
-    visible &= (x0 >= 0) & (x0 <= width - 1) & (y0 >= 0) & (y0 <= height - 1)
+        rim = jnp.abs(inside[k - 1]) - edge[k - 1]
+        clear = jnp.where(owned, rim, jnp.minimum(rim, clear))
+    inside = distances(then_to_plane, x0, y0)
+    for k in objects:
+        clear = jnp.where(front < k, jnp.minimum(-inside[k - 1] - edge[k - 1], clear), clear)
+    visible = (x0 >= 0) & (x0 <= width - 1) & (y0 >= 0) & (y0 <= height - 1) & (clear >= 0)
     return jnp.stack([x - x0, y - y0], -1), visible
 
 

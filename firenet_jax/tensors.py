@@ -30,6 +30,9 @@ BINS = 5
 CAPACITIES = tuple(2**14 * 8**k for k in range(6))
 
 
+BLOCK = 2**16  # events that vote at once on a CPU
+
+
 class Packed(NamedTuple):
     """The events of T x B windows as one flat list of E places, some unused at the end."""
 
@@ -125,22 +128,32 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
         raise ValueError(
             f"{windows} windows of {width}x{height} are too many for one chunk: use a smaller one"
         )
-    # Indices of unused places reach past the end of t_min; they are clamped and later dropped.
-    window, x, y = (c.astype(jnp.int32) for c in (packed.window, packed.x, packed.y))
-    since = packed.t - packed.t_min.ravel()[window]  # int32: exact, modulo 2^32
-    t_star = (BINS - 1) * since.astype(jnp.float32) / packed.duration.ravel()[window]
-    seen = (0 <= x) & (x < width) & (0 <= y) & (y < height) & (window < windows)
-
-    # The triangle is not zero in two bins only, those around t*. (Vote, event) is (2, E).
-    bins = jnp.floor(t_star)[None] + jnp.array([[0.0], [1.0]])
-    votes = jnp.where(packed.p, 1.0, -1.0)[None] * (1 - jnp.abs(bins - t_star[None]))
-    # One plane a bin, so that consecutive events, close in time, vote close in memory.
-    pixel = (window * height + y) * width + x
-    place = bins.astype(jnp.int32) * (windows * plane) + pixel[None]
-    # A place past the end is dropped by segment_sum; a negative one would wrap round.
     places = BINS * windows * plane
-    place = jnp.where(seen[None] & (0 <= bins) & (bins < BINS), place, places)
-    planes = jax.ops.segment_sum(votes.ravel(), place.ravel(), places)
+
+    def vote(planes, columns):
+        t, x, y, p, window = columns
+        # Indices of unused places reach past the end of t_min; they are clamped and dropped later.
+        window, x, y = (column.astype(jnp.int32) for column in (window, x, y))
+        since = t - packed.t_min.ravel()[window]  # int32: exact, modulo 2^32
+        t_star = (BINS - 1) * since.astype(jnp.float32) / packed.duration.ravel()[window]
+        seen = (0 <= x) & (x < width) & (0 <= y) & (y < height) & (window < windows)
+
+        # The triangle is not zero in two bins only, those around t*. (Vote, event) is (2, E).
+        bins = jnp.floor(t_star)[None] + jnp.array([[0.0], [1.0]])
+        votes = jnp.where(p, 1.0, -1.0)[None] * (1 - jnp.abs(bins - t_star[None]))
+        # One plane a bin, so that consecutive events, close in time, vote close in memory.
+        pixel = (window * height + y) * width + x
+        place = bins.astype(jnp.int32) * (windows * plane) + pixel[None]
+        # A place past the end is dropped; a negative one would wrap round.
+        place = jnp.where(seen[None] & (0 <= bins) & (bins < BINS), place, places)
+        return planes.at[place.ravel()].add(votes.ravel(), mode="drop"), None
+
+    # A sum over segments, block by block: what a block votes stays in a CPU's cache, which is a
+    # fifth faster for a million events. Accelerators take the list as one block.
+    size = packed.t.shape[0]
+    block = BLOCK if jax.default_backend() == "cpu" and size % BLOCK == 0 else size
+    columns = jax.tree.map(lambda column: column.reshape(-1, block), packed[:5])
+    planes, _ = jax.lax.scan(vote, jnp.zeros(places), columns)
     return planes.reshape(BINS, steps, batch, height, width).transpose(1, 2, 3, 4, 0)
 
 

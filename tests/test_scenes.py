@@ -59,7 +59,7 @@ def still(scenes):
         places=places,
         camera=camera,
         motions=motions,
-        outlines=tuple(jnp.full_like(outline, -9.0) for outline in scene.outlines),
+        outlines=jnp.full_like(scene.outlines, -9.0),
         pauses=jnp.zeros_like(scene.pauses).at[:, 2].set(0.01),
     )
 
