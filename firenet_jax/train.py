@@ -34,6 +34,8 @@ from firenet_jax.scenes import SceneSettings, load_textures
 from firenet_jax.sensor import FAULTY, SensorSettings, Simulation, sequences
 from firenet_jax.tensors import normalise
 
+TEXTURE = 256  # pixels on a side of a texture
+
 
 @dataclass(frozen=True)
 class Train:
@@ -54,9 +56,10 @@ class Train:
     textures: int = 256
     """How many textures to cut from them."""
     steps: int = 20_000
+    """Updates of the parameters."""
     batch: int = 2
     """Sequences in a step."""
-    size: int = 96
+    crop: int = 96
     """Height and width of the sequences, in pixels."""
     windows: int = 21
     """Windows in a sequence, L + 1 in the paper."""
@@ -69,12 +72,15 @@ class Train:
     clip: float = 1.0
     """Gradients are scaled down to this norm."""
     seed: int = 0
+    """Of the first parameters, the textures and all sequences."""
     bfloat16: bool = False
     """Convolutions in bfloat16."""
     remat: bool = False
     """Compute each step's maps again for the gradient: less memory, more time."""
     log_every: int = 20
+    """Steps between two lines of the log."""
     validate_every: int = 500
+    """Steps between two validations."""
     save_every: float = 120.0
     """Seconds between two checkpoints."""
     loss: Loss = Loss()
@@ -82,7 +88,7 @@ class Train:
     sensor: SensorSettings = dataclasses.replace(FAULTY, threshold_range=(0.1, 0.6))
 
     def __post_init__(self):
-        for name in ("textures", "steps", "batch", "size", "renderings", "learning_rate", "clip"):
+        for name in ("textures", "steps", "batch", "crop", "renderings", "learning_rate", "clip"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}, but must be more than 0")
         if not self.loss.l0 < self.windows <= self.loss.L + 1:
@@ -125,8 +131,8 @@ def simulated(key: jax.Array, textures: jax.Array, settings: Train) -> Simulatio
         textures,
         batch=settings.batch,
         windows=settings.windows,
-        height=settings.size,
-        width=settings.size,
+        height=settings.crop,
+        width=settings.crop,
         renderings=settings.renderings,
         scene=settings.scene,
         sensor=settings.sensor,
@@ -181,7 +187,7 @@ def run(settings: Train) -> None:
     """Trains as the settings say, going on where an interrupted run stopped."""
     folder = settings.output
     _same_settings(folder, settings)
-    training, held_out = textures_of(settings)
+    training, others = textures_of(settings)
     key, validation_key = jax.random.split(jax.random.key(settings.seed + 1))
     validation_keys = jax.random.split(validation_key, 8)
     state = initial_train_state(settings)
@@ -203,9 +209,7 @@ def run(settings: Train) -> None:
                     progress.set_postfix(loss=f"{terms['loss']:.3f}", refresh=False)
                     _check_finite(terms, state, folder)
                 if done % settings.validate_every == 0 or done == settings.steps:
-                    scores = [
-                        validate(state.params, k, held_out, settings) for k in validation_keys
-                    ]
+                    scores = [validate(state.params, k, others, settings) for k in validation_keys]
                     means = jax.tree.map(lambda *values: np.mean(values), *scores)
                     means = log.write(done, "validation", means)
                     if means["loss"] < best:
@@ -219,11 +223,14 @@ def run(settings: Train) -> None:
 
 
 def textures_of(settings: Train) -> tuple[jax.Array, jax.Array]:
-    """Textures to train on, and others, cut from other pictures, to validate on."""
-    size = 256
-    training = load_textures(settings.images, settings.textures, size, settings.seed)
-    held_out = load_textures(settings.images, 32, size, settings.seed + 1)
-    return jnp.asarray(training), jnp.asarray(held_out)
+    """Textures to train on, and others to validate on.
+
+    The others are cut anew, but from the same pictures: they choose between the steps of a run;
+    how good a network is on pictures it never saw they do not tell.
+    """
+    training = load_textures(settings.images, settings.textures, TEXTURE, settings.seed)
+    others = load_textures(settings.images, 32, TEXTURE, settings.seed + 1)
+    return jnp.asarray(training), jnp.asarray(others)
 
 
 class Log:

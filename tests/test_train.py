@@ -15,7 +15,7 @@ from firenet_jax.train import Log, Train, images_of, initial_train_state, run, t
 
 def tiny(folder, **kwargs):
     choices = {
-        "steps": 6, "batch": 2, "size": 32, "windows": 3, "warmup": 1,
+        "steps": 6, "batch": 2, "crop": 32, "windows": 3, "warmup": 1,
         "textures": 4, "log_every": 1, "validate_every": 3, "save_every": 0.0,
         "loss": Loss(l0=1), "scene": SceneSettings(objects=0),
     }  # fmt: skip
