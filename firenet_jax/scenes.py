@@ -5,7 +5,8 @@ paper, and several textured objects before it, each a plane of its own with its 
 outline; the nearer hides the farther. Nothing is simulated step by step: `render` and `flow` give
 the picture and the exact displacement at any times, so frames can be as dense as a sensor asks.
 
-Times are seconds since the scene's start, float32. Images are (H, W) float32 in [0, 1], grey
+Times are seconds since the scene's start, float32, which tells microseconds apart for about a
+minute. Images are (H, W) float32 in [0, 1], grey
 values as they stand in picture files (the published network was trained on these). Lengths in the
 world are pixels as seen at the rest distance of the background. All functions of JAX here are
 written for one scene; `jax.vmap` makes them functions of many. Pictures become textures
@@ -148,7 +149,7 @@ def random_scene(
     # fifth farther away than at rest, and looking up bilinearly already blurs by 0.4 texture
     # pixels.
     sigma = jnp.sqrt(jnp.maximum((0.5 * 1.2 / zoom) ** 2 - 0.4**2, 1e-4))
-    canvases = jax.vmap(_blurred)(lit, sigma)
+    canvases = jnp.clip(jax.vmap(_blurred)(lit, sigma), 0.0, 1.0)  # rounding may exceed 1
     origin = (size - 1) / 2 + uniform((-0.15, 0.15), (planes, 2)) * size
 
     outlines = jax.vmap(_outline)(jax.random.split(outline_keys, settings.objects))

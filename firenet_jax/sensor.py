@@ -264,8 +264,7 @@ def _stamps(first, spacing, number):
 @jax.jit
 def _listed(sensor, state, image, duration):
     state, runs = step(sensor, state, image, duration)
-    fired = runs[0].count.sum() if len(runs) == 1 else (runs[0].count + runs[1].count).sum()
-    return state, runs, fired
+    return state, runs, sum(run.count.sum() for run in runs)
 
 
 def event_list(sensor: Sensor, renderings: Iterable[tuple[int, np.ndarray]]) -> Iterator[Events]:
@@ -303,8 +302,8 @@ def _events(runs: tuple[Run, ...], start: int) -> Events:
         y, x = np.nonzero(run.count)
         first, spacing, count = run.first[y, x], run.spacing[y, x], run.count[y, x]
         row = np.repeat(np.arange(len(count)), count)
-        number = np.arange(len(row), dtype=np.int32) - np.repeat(np.cumsum(count) - count, count)
-        t = _stamps(first[row], spacing[row], number.astype(np.int32))
+        number = (np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)).astype(np.int32)
+        t = _stamps(first[row], spacing[row], number)
         on = run.polarity[y, x][row] > 0
         chunks.append(Events.of(start + t.astype(np.int64), x[row], y[row], on))
     events = concatenate(chunks)
@@ -315,7 +314,7 @@ def _events(runs: tuple[Run, ...], start: int) -> Events:
 
 
 class Simulation(NamedTuple):
-    """T windows of B sequences. `pictures` and `displacement` belong to the windows' ends."""
+    """T windows of B sequences. Images and displacement belong to the windows' ends."""
 
     tensors: jax.Array  # (T, B, H, W, 5) float32, not normalised, window bounds as t_min and t_max
     images: jax.Array  # (T, B, H, W) float32 in [0, 1], the truth at the window's end
@@ -420,7 +419,7 @@ def _votes(planes: jax.Array, low, runs, passed: jax.Array, total: jax.Array) ->
         "sensor",
     ),
 )
-def sequences(
+def random_setups(
     key: jax.Array,
     textures: jax.Array,
     *,
@@ -432,8 +431,8 @@ def sequences(
     motion: tuple[float, float] = (1.25, 2.5),
     scene: SceneSettings = SceneSettings(),
     sensor: SensorSettings = SensorSettings(),
-) -> Simulation:
-    """key, textures (N, S, S) -> training data: random scenes before random sensors.
+) -> tuple[Sensor, Scene, jax.Array]:
+    """key, textures (N, S, S) -> sensors, scenes, bounds: B random setups for `simulate`.
 
     The windows of a sequence all last equally long: so that at its fastest time the fastest point
     moves by so many pixels as `motion` says (least, greatest; log-uniform), but 1 to 300 ms.
@@ -444,32 +443,40 @@ def sequences(
             f"windows with {motion[1]} pixels of motion need {math.ceil(2 * motion[1])} "
             f"renderings, not {renderings}"
         )
-    scene_key, sensor_key, speed_key, motion_key = jax.random.split(key, 4)
+    scene_key, sensor_key, number_key = jax.random.split(key, 3)
+    numbers = jax.random.uniform(number_key, (2, batch))
 
-    def log_uniform(key, low, high):
-        return jnp.exp(
-            jax.random.uniform(key, (batch,), minval=math.log(low), maxval=math.log(high))
-        )
+    def log_uniform(bounds, numbers):
+        low, high = (math.log(bound) for bound in bounds)
+        return jnp.exp(low + (high - low) * numbers)
 
-    speed = log_uniform(speed_key, *scene.speed)
-    moved = log_uniform(motion_key, *motion)
-    duration = jnp.clip(1e6 * moved / speed, 1e3, 3e5).astype(jnp.int32)
+    speed = log_uniform(scene.speed, numbers[0])
+    duration = 1e6 * log_uniform(motion, numbers[1]) / speed
+    duration = jnp.clip(duration, 1e3, 3e5).astype(jnp.int32)
     speed = jnp.minimum(speed, 1e6 * 0.5 * renderings / duration)
+    size = {"height": height, "width": width}
 
-    def one(key, duration, speed):
-        return random_scene(
-            key,
-            textures,
-            height=height,
-            width=width,
-            duration=1e-6 * windows * duration,
-            speed=speed,
-            settings=scene,
-        )
+    def one_scene(key, duration, speed):
+        seconds = 1e-6 * windows * duration
+        return random_scene(key, textures, duration=seconds, speed=speed, settings=scene, **size)
 
-    scenes = jax.vmap(one)(jax.random.split(scene_key, batch), duration, speed)
-    sensors = jax.vmap(partial(random_sensor, height=height, width=width, settings=sensor))(
-        jax.random.split(sensor_key, batch)
-    )
+    scenes = jax.vmap(one_scene)(jax.random.split(scene_key, batch), duration, speed)
+    one_sensor = partial(random_sensor, settings=sensor, **size)
+    sensors = jax.vmap(one_sensor)(jax.random.split(sensor_key, batch))
     bounds = jnp.arange(windows + 1, dtype=jnp.int32)[:, None] * duration[None]
-    return simulate(sensors, scenes, bounds, height=height, width=width, renderings=renderings)[1]
+    return sensors, scenes, bounds
+
+
+def sequences(
+    key: jax.Array,
+    textures: jax.Array,
+    *,
+    height: int,
+    width: int,
+    renderings: int = 5,
+    **settings,
+) -> Simulation:
+    """key, textures (N, S, S) -> training data; `settings` are those of `random_setups`."""
+    shared = {"height": height, "width": width, "renderings": renderings}
+    setups = random_setups(key, textures, **shared, **settings)
+    return simulate(*setups, **shared)[1]

@@ -35,6 +35,7 @@ def sample(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
     return (1 - down) * top + down * bottom
 
 
+@jax.jit
 def warp(image: jax.Array, displacement: jax.Array) -> tuple[jax.Array, jax.Array]:
     """(..., H, W), (..., H, W, 2) -> warped (..., H, W), visible (..., H, W) bool.
 

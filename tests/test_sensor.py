@@ -1,3 +1,4 @@
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -10,7 +11,7 @@ from firenet_jax import sensor as module
 from firenet_jax.events import Events, concatenate
 from firenet_jax.network import initial_state
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.scenes import SceneSettings, load_textures, random_scene, rendering_times, video
+from firenet_jax.scenes import SceneSettings, load_textures, rendering_times, video
 from firenet_jax.sensor import (
     EPS,
     FAULTY,
@@ -211,6 +212,16 @@ def test_large_times_lose_no_microsecond():
 # ---- Sensors and their faults
 
 
+# Every fault there is, but none to be seen: one compiled program for the tests below.
+QUIET = SensorSettings(
+    mismatch=1e-9, noise=(1e-9, 1e-9), leak=(1e-9, 1e-9), hot=(1e-9, 1e-9), cutoff=(1e6, 1e6)
+)
+
+
+def with_only(seed, **faults):
+    return random_sensor(jax.random.key(seed), height=H, width=W, settings=replace(QUIET, **faults))
+
+
 def still(seconds, step=10_000):
     times = np.arange(0, round(1e6 * seconds) + 1, step)
     return times, np.full((len(times), H, W), -1.0)
@@ -245,20 +256,14 @@ def test_a_still_scene_is_silent_without_faults():
 
 
 def test_leaks_are_on_events_at_their_rate_and_not_all_at_once():
-    sensor = random_sensor(
-        jax.random.key(3), height=H, width=W, settings=SensorSettings(leak=(2.0, 2.0))
-    )
-    events = listed(sensor, *still(5.0))
+    events = listed(with_only(3, leak=(2.0, 2.0)), *still(5.0))
     assert events.p.all() and len(events) == pytest.approx(5 * 2 * H * W, rel=0.02)
     counts = np.histogram(events.t, 20)[0]
     assert counts.max() < 1.6 * counts.mean()
 
 
 def test_shot_noise_has_its_rate_no_order_and_both_polarities():
-    sensor = random_sensor(
-        jax.random.key(4), height=H, width=W, settings=SensorSettings(noise=(3.0, 3.0))
-    )
-    events = listed(sensor, *still(10.0))
+    events = listed(with_only(4, noise=(3.0, 3.0)), *still(10.0))
     expected = 10 * 3 * H * W  # 5040, standard deviation 71
     assert abs(len(events) - expected) < 300
     assert abs(events.p.mean() - 0.5) < 0.03
@@ -269,31 +274,27 @@ def test_shot_noise_has_its_rate_no_order_and_both_polarities():
 
 
 def test_hot_pixels_are_few_and_fire_all_the_time():
-    sensor = random_sensor(
-        jax.random.key(5), height=60, width=70, settings=SensorSettings(hot=(0.01, 0.01))
-    )
-    times = np.arange(0, 500_001, 10_000)
-    events = listed(sensor, times, np.full((len(times), 60, 70), -1.0))
-    counts = np.bincount(events.y.astype(int) * 70 + events.x, minlength=60 * 70)
-    assert 20 <= (counts > 0).sum() <= 70  # 42 expected
-    rates = counts[counts > 0] / 0.5
-    assert rates.min() >= 6 and rates.max() <= 502
-    assert 0 < events.p.mean() < 1
+    events = listed(with_only(5, hot=(0.2, 0.2)), *still(1.0))
+    counts = np.bincount(events.y.astype(int) * W + events.x, minlength=H * W)
+    assert 20 <= (counts > 0).sum() <= 47  # 34 expected, standard deviation 5
+    rates = counts[counts > 0]
+    assert rates.min() >= 9 and rates.max() <= 501
+    assert 0.1 < events.p.mean() < 0.9
 
 
 def test_bandwidth_lets_slow_changes_pass_and_holds_fast_ones_back():
     """A first-order low-pass of 100 Hz: a step's crossings come late, by its exponential."""
-    sensor = plain_sensor()._replace(cutoff=jnp.array([100.0, 1.0]))
-    times = np.arange(0, 30_000, 20)
-    logs = np.where(times > 0, -1.0, -3.0)[:, None, None]
-    events = listed(sensor, times, logs)
-    k = np.arange(1, 10)
-    tau = 1e6 / (2 * np.pi * 100)
-    expected = -tau * np.log1p(-k * 0.2 / 2.0)
-    np.testing.assert_allclose(events.t[:9], expected, atol=25)
+    times = np.arange(0, 20_000, 20)
+    logs = np.broadcast_to(np.where(times > 0, -1.0, -3.0)[:, None, None], (1000, H, W))
+    sensor = with_only(6, cutoff=(100.0, 100.0), cutoff_dark=1.0, refractory=1e-6)
+    t, _ = at_pixel(listed(sensor, times, logs), 0, 0)
+    k, tau = np.arange(1, len(t) + 1) - float(sensor.phase[0, 0]), 1e6 / (2 * np.pi * 100)
+    expected = -tau * np.log1p(-k * float(sensor.on[0, 0]) / 2.0)
+    assert len(t) >= 7
+    np.testing.assert_allclose(t, expected, atol=25)
     # In the dark it is slower, where the setting says so.
-    dark = sensor._replace(cutoff=jnp.array([100.0, 0.1]))
-    assert listed(dark, times, logs).t[0] > 1.5 * events.t[0]
+    dark = with_only(6, cutoff=(100.0, 100.0), cutoff_dark=0.1, refractory=1e-6)
+    assert at_pixel(listed(dark, times, logs), 0, 0)[0][0] > 1.5 * t[0]
 
 
 def test_the_same_key_gives_the_same_events():
@@ -314,27 +315,35 @@ B, T, SIZE, RENDERINGS = 2, 6, 48, 5
 SQUARE = {"height": SIZE, "width": SIZE}
 
 
+SETTINGS = dict(batch=B, windows=T, renderings=RENDERINGS, motion=(2.0, 2.5), **SQUARE) | dict(
+    scene=SceneSettings(objects=1, pause=0.0, speed=(60.0, 400.0)), sensor=FAULTY
+)
+
+
 @pytest.fixture(scope="module")
-def scenes():
-    """A slow and a fast one, with an object each."""
-    textures = jnp.asarray(load_textures(None, 8, 64, seed=1))
-    settings = SceneSettings(objects=1, pause=0.0)
+def textures():
+    return load_textures(None, 8, 64, seed=1)
 
-    def draw(key, speed):
-        return random_scene(key, textures, duration=0.3, speed=speed, settings=settings, **SQUARE)
 
-    keys = jax.random.split(jax.random.key(3), B)
-    return jax.jit(jax.vmap(draw))(keys, jnp.array([60.0, 400.0]))
+@pytest.fixture(scope="module")
+def setups(textures):
+    """Sensors with every fault, a slow and a fast scene with an object each, bounds."""
+    return module.random_setups(jax.random.key(8), textures, **SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def scenes(setups):
+    return setups[1]
 
 
 @pytest.fixture(scope="module", params=["clean", "faulty"])
-def simulated(request, scenes):
+def simulated(request, setups):
     """The scenes before two sensors, and all that made the events."""
-    settings = {"clean": SensorSettings(), "faulty": FAULTY}[request.param]
-    draw = jax.vmap(lambda key: random_sensor(key, settings=settings, **SQUARE))
-    sensors = draw(jax.random.split(jax.random.key(4), B))
-    window = (1e6 * 0.5 * RENDERINGS / scenes.speed).astype(jnp.int32)
-    bounds = 1000 + jnp.arange(T + 1, dtype=jnp.int32)[:, None] * window[None]
+    sensors, scenes, bounds = setups
+    if request.param == "clean":
+        keys = jax.random.split(jax.random.key(4), B)
+        sensors = jax.vmap(lambda key: random_sensor(key, **SQUARE))(keys)
+    bounds = bounds + 1000
     simulation = simulate(sensors, scenes, bounds, renderings=RENDERINGS, **SQUARE)[1]
     return SimpleNamespace(sensors=sensors, bounds=bounds, simulation=simulation)
 
@@ -394,7 +403,7 @@ def test_no_more_than_half_a_pixel_between_two_renderings(simulated):
 def test_simulation_goes_on_where_it_ended(simulated, scenes):
     bounds, parts = simulated.bounds, []
     first = [next(video(of_sequence(scenes, b), bounds[:1, b], **SQUARE))[1] for b in range(B)]
-    state = jax.vmap(module.first_state)(simulated.sensors, jnp.stack(first))
+    state = jax.jit(jax.vmap(module.first_state))(simulated.sensors, np.stack(first))
     for part in (bounds[: T // 2 + 1], bounds[T // 2 :]):
         state, made = simulate(
             simulated.sensors, scenes, part, state, renderings=RENDERINGS, **SQUARE
@@ -421,35 +430,36 @@ def test_the_runs_of_given_pictures_vote_as_their_events_do():
     sensor = random_sensor(jax.random.key(9), height=H, width=W, settings=FAULTY)
     times = np.array([0, 3000, 7001, 9000, 14_000])
     images = (np.exp(random_logs(10, times)) - EPS).astype(np.float32)
-    state, planes = module.first_state(sensor, jnp.asarray(images[0])), jnp.zeros((5, 1, H, W))
-    one_step = jax.jit(module.step)
+    state, planes = module.first_state(sensor, jnp.asarray(images[0])), np.zeros((5, 1, H, W), "f4")
+    one_step, votes = jax.jit(module.step), jax.jit(module._votes)
     for k in range(1, len(times)):
         duration = jnp.int32(times[k] - times[k - 1])
         state, runs = one_step(sensor, state, jnp.asarray(images[k]), duration)
         batch = jax.tree.map(lambda leaf: leaf[None], runs)
-        passed, total = jnp.array([times[k - 1]]), jnp.array([times[-1]])
-        planes = module._votes(planes, 0, batch, passed, total)
+        passed, total = (np.array([t], np.int32) for t in (times[k - 1], times[-1]))
+        planes = votes(planes, 0, batch, passed, total)
     events = concatenate(list(event_list(sensor, zip(times, images, strict=True))))
     tensor = voxelise(pack([[events]], bounds=np.array([[[0, times[-1]]]])), height=H, width=W)
-    np.testing.assert_allclose(planes[:, 0].transpose(1, 2, 0), tensor[0, 0], atol=2e-5)
+    planes = np.asarray(planes)[:, 0].transpose(1, 2, 0)
+    np.testing.assert_allclose(planes, tensor[0, 0], atol=2e-5)
     assert int(state.renderings) == 4
 
 
-def test_random_sequences_have_the_declared_shapes_and_do_not_retrace():
-    textures = jnp.asarray(load_textures(None, 4, 32, seed=2, procedural=1.0))
-    settings = dict(batch=2, windows=3, height=20, width=24, renderings=4, motion=(0.5, 2.0))
-    settings |= dict(scene=SceneSettings(objects=0))
-    sequences.clear_cache()
+def test_random_sequences_have_the_declared_shapes_and_do_not_retrace(textures):
+    compiled = []
     for seed in range(2):
-        made = sequences(jax.random.key(seed), textures, **settings)
-    assert sequences._cache_size() == 1
-    assert made.tensors.shape == (3, 2, 20, 24, 5) and made.images.shape == (3, 2, 20, 24)
-    assert made.displacement.shape == (3, 2, 20, 24, 2) and made.visible.dtype == bool
+        made = sequences(jax.random.key(seed), textures, **SETTINGS)
+        compiled.append((module.random_setups._cache_size(), simulate._cache_size()))
+    assert compiled[0] == compiled[1]
+    shape = T, B, SIZE, SIZE
+    assert made.tensors.shape == (*shape, 5) and made.images.shape == shape
+    assert made.displacement.shape == (*shape, 2) and made.visible.shape == shape
+    assert made.visible.dtype == bool
     for leaf in made:
         assert np.isfinite(leaf).all()
     assert made.images.min() >= 0 and made.images.max() <= 1
     with pytest.raises(ValueError, match="6 renderings"):
-        sequences(jax.random.key(0), textures, **(settings | dict(motion=(1.0, 3.0))))
+        sequences(jax.random.key(0), textures, **(SETTINGS | dict(motion=(1.0, 3.0))))
 
 
 @pytest.mark.slow
