@@ -6,11 +6,11 @@ outline; the nearer hides the farther. Nothing is simulated step by step: `rende
 the picture and the exact displacement at any times, so frames can be as dense as a sensor asks.
 
 Times are seconds since the scene's start, float32, which tells microseconds apart for about a
-minute. Images are (H, W) float32 in [0, 1], grey
-values as they stand in picture files (the published network was trained on these). Lengths in the
-world are pixels as seen at the rest distance of the background. All functions of JAX here are
-written for one scene; `jax.vmap` makes them functions of many. Pictures become textures
-(N, S, S) float32 on the host, in numpy and Pillow: `load_textures`.
+minute. Images are (H, W) float32 in [0, 1], grey values as they stand in picture files (the
+published network was trained on these). Lengths in the world are pixels as seen at the rest
+distance of the background. All functions of JAX here are written for one scene; `jax.vmap` makes
+them functions of many. Pictures become textures (N, S, S) float32 on the host, in numpy and
+Pillow: `load_textures`.
 """
 
 import importlib.util
