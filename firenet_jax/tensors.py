@@ -25,7 +25,7 @@ from firenet_jax.windows import Windows, cut
 
 BINS = 5
 
-# A flat list of events is padded to one of these sizes: at most 8 times too long, at about 4 ns
+# A flat list of events is padded to one of these sizes: at most 8 times too long, at a few ns
 # for each event too many, against a compilation of seconds for each new size.
 CAPACITIES = tuple(2**14 * 8**k for k in range(6))
 

@@ -79,7 +79,7 @@ def read(path: Path, member: str | None = None) -> Source:
 def opened(path: Path, member: str | None = None) -> Iterator[BinaryIO]:
     """A file, or a file in a zip -> stream of its bytes; damage raises RecordingError."""
     broken = (zipfile.BadZipFile, zlib.error, EOFError, gzip.BadGzipFile)
-    # RuntimeError: an encrypted member, or (NotImplementedError) an unknown compression.
+    # RuntimeError: an encrypted member, or (its subclass) an unknown compression.
     with reading(path, *broken, RuntimeError), ExitStack() as stack:
         if member is not None:
             archive = stack.enter_context(zipfile.ZipFile(path))
