@@ -29,7 +29,6 @@ BINS = 5
 # for each event too many, against a compilation of seconds for each new size.
 CAPACITIES = tuple(2**14 * 8**k for k in range(6))
 
-
 BLOCK = 2**16  # events that vote at once on a CPU
 
 

@@ -121,7 +121,13 @@ def initial_train_state(settings: Train) -> TrainState:
     if settings.weights is None:
         params = initial_params(jax.random.key(settings.seed))
     else:
-        params = jax.tree.map(jnp.asarray, load_weights(settings.weights).params)
+        weights = load_weights(settings.weights)
+        if not weights.normalise:
+            raise ValueError(
+                f"{settings.weights} expects tensors that are not normalised, training normalises "
+                "them: start from other weights, or from none"
+            )
+        params = jax.tree.map(jnp.asarray, weights.params)
     return TrainState(params, optimiser(settings).init(params), jnp.int32(0))
 
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from firenet_jax import train
-from firenet_jax.checkpoint import load_weights
+from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.losses import Loss
+from firenet_jax.network import Weights, initial_params
 from firenet_jax.scenes import SceneSettings
 from firenet_jax.train import Log, Train, images_of, initial_train_state, run, train_step
 
@@ -92,6 +93,13 @@ def test_other_settings_do_not_continue_a_run(tmp_path):
     train._same_settings(tmp_path, tiny(tmp_path))
     with pytest.raises(ValueError, match="other settings"):
         train._same_settings(tmp_path, tiny(tmp_path, seed=1))
+
+
+def test_weights_that_expect_other_tensors_are_refused(tmp_path):
+    path = tmp_path / "plus.npz"
+    save_weights(path, Weights(initial_params(jax.random.key(0)), normalise=False))
+    with pytest.raises(ValueError, match="plus.npz expects tensors that are not normalised"):
+        initial_train_state(tiny(tmp_path, weights=path))
 
 
 def test_the_log_forgets_what_comes_after_the_checkpoint(tmp_path):
