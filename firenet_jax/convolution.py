@@ -46,7 +46,8 @@ def kernel_gradient(image: jax.Array, kernel: jax.Array, gradient: jax.Array) ->
     """dK[i, j] = sum over all pixels of image[y + i - r, x + j - c] gradient[y, x]^T.
 
     A matrix product for each row i of the kernel: the image shifted by i rows, times the
-    gradient shifted against the columns j of the kernel, these side by side as channels.
+    gradient shifted against the columns j of the kernel, these side by side as channels. Both as
+    (pixels, channels): summed over three axes instead of one, products take XLA four times as long.
     """
     rows, columns, inputs, outputs = kernel.shape
     height, width = image.shape[1:3]
@@ -54,11 +55,10 @@ def kernel_gradient(image: jax.Array, kernel: jax.Array, gradient: jax.Array) ->
     image = jnp.pad(image, ((0, 0), (r, r), (0, 0), (0, 0)))
     gradient = jnp.pad(gradient, ((0, 0), (0, 0), (c, c), (0, 0)))
     shifted = [gradient[:, :, columns - 1 - j :][:, :, :width] for j in range(columns)]
-    beside = jnp.concatenate(shifted, -1)  # (B, H, W, columns O)
+    beside = jnp.concatenate(shifted, -1).reshape(-1, columns * outputs)
     products = [
-        jnp.einsum(
-            "byxi,byxo->io",
-            image[:, i : i + height],
+        jnp.matmul(
+            image[:, i : i + height].reshape(-1, inputs).T,
             beside,
             preferred_element_type=jnp.float32,  # a sum over all pixels: too long for bfloat16
         )

@@ -78,6 +78,7 @@ def sequence_loss(
     displacements: jax.Array,
     visible: jax.Array,
     settings: Loss = Loss(),
+    warm: jax.Array | bool = False,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Eq. 2 for T images in time order, T at most L + 1 -> (loss, its terms).
 
@@ -85,6 +86,7 @@ def sequence_loss(
     displacements: (T, B, H, W, 2) pixels, x then y, from image k-1 to k on the grid of k.
     visible: (T, B, H, W) bool, False where image k shows what image k-1 did not.
     displacements[0] and visible[0] are not used: image 0 has no predecessor here.
+    warm: () bool, whether the state was warm before image 0, so that l0 does not apply.
 
     loss: scalar. Terms: scalars, unweighted means over batch and images (only those that count,
     for "temporal"), so that they compare between lengths; "reconstruction" is the mean of L_R:
@@ -100,7 +102,9 @@ def sequence_loss(
     terms = {"reconstruction": per_image, **terms}
     loss = per_image.sum(0).mean()
 
-    first = max(settings.l0, 1)
+    # Where `warm` is only known as the program runs, all are computed and some do not count.
+    known = isinstance(warm, bool)
+    first = max(settings.l0, 1) if known and not warm else 1
     if settings.lambda_tc and first < steps:
         now, before = slice(first, None), slice(first - 1, -1)
         errors = metrics.temporal_error(
@@ -111,6 +115,10 @@ def sequence_loss(
             truths[before],
             visible[now],
         )  # (T - first, B)
-        loss += settings.lambda_tc * errors.sum(0).mean()
-        terms["temporal"] = errors
+        counted = jnp.ones(len(errors))
+        if not known:
+            counted = (warm | (jnp.arange(first, steps) >= settings.l0)).astype(jnp.float32)
+        total = counted @ errors.mean(1)
+        loss += settings.lambda_tc * total
+        terms["temporal"] = total / jnp.maximum(counted.sum(), 1)
     return loss, {name: term.mean() for name, term in terms.items()}

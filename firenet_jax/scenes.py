@@ -593,11 +593,17 @@ def video(
 
 # ---- Textures
 
-PHOTOGRAPHS = (  # of those that come with scikit-image itself, not downloaded by it
-    "astronaut.png", "brick.png", "camera.png", "chelsea.png", "coffee.png",
-    "coins.png", "grass.png", "gravel.png", "hubble_deep_field.jpg", "ihc.png", "moon.png",
-    "motorcycle_left.png", "motorcycle_right.png", "page.png", "retina.jpg", "rocket.jpg",
-)  # fmt: skip
+PHOTOGRAPHS = {  # that come inside the wheels of these packages
+    "skimage/data": (
+        "brick.png", "camera.png", "coins.png", "grass.png", "gravel.png", "hubble_deep_field.jpg",
+        "ihc.png", "moon.png", "motorcycle_left.png", "motorcycle_right.png", "page.png",
+        "retina.jpg", "rocket.jpg",
+    ),
+}  # fmt: skip
+HELD_OUT = {  # frozen before any training: to judge networks by, in no pool that they train on
+    "skimage/data": ("astronaut.png", "chelsea.png", "coffee.png"),
+    "sklearn/datasets/images": ("china.jpg", "flower.jpg"),
+}
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 
 
@@ -610,8 +616,9 @@ def load_textures(
 ) -> np.ndarray:
     """Pictures -> textures (count, size, size) float32 in [0, 1], grey, cut at random.
 
-    folder: of pictures (searched with its subfolders; .jpg, .png and others); only as many as
-    are asked for are opened. None: the photographs that come with scikit-image, where installed.
+    folder: of pictures (searched with its subfolders; .jpg, .png and others), without those of
+    `HELD_OUT`, known by their names; only as many as are asked for are opened. None: the
+    photographs that come with scikit-image, where installed.
     procedural: part of the textures that is drawn instead (`PROCEDURAL`); None: none of them
     where a folder is named, else a quarter.
     Raises ValueError where the folder holds no picture that can be used.
@@ -627,23 +634,27 @@ def load_textures(
     return np.stack(textures).astype(np.float32)
 
 
-def photographs() -> list[Path]:
-    """The pictures inside scikit-image's wheel; none where it is not installed."""
-    spec = importlib.util.find_spec("skimage")
-    if spec is None or not spec.submodule_search_locations:
-        return []
-    folder = Path(spec.submodule_search_locations[0]) / "data"
-    return [folder / name for name in PHOTOGRAPHS if (folder / name).exists()]
+def photographs(packages: dict[str, tuple[str, ...]] = PHOTOGRAPHS) -> list[Path]:
+    """The pictures inside the wheels of these packages; none of a package not installed."""
+    found = []
+    for folder, names in packages.items():
+        package, _, inside = folder.partition("/")
+        spec = importlib.util.find_spec(package)
+        if spec is not None and spec.submodule_search_locations:
+            place = Path(spec.submodule_search_locations[0]) / inside
+            found += [place / name for name in names if (place / name).exists()]
+    return found
 
 
 def _pictures(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise ValueError(f"{folder}: no such folder: name one with pictures in it")
+    held_out = {name for names in HELD_OUT.values() for name in names}
     found = [
         Path(at) / name
         for at, _, names in os.walk(folder)
         for name in names
-        if name.lower().endswith(SUFFIXES)
+        if name.lower().endswith(SUFFIXES) and name.lower() not in held_out
     ]
     if not found:
         raise ValueError(
@@ -676,14 +687,19 @@ def _cuttings(rng, paths: list[Path], count: int, size: int, folder) -> list[np.
 
 
 def _cutting(rng, path: Path, size: int) -> np.ndarray:
-    """A square of 70 to 100 % of the picture's shorter side, perhaps mirrored, as (size, size)."""
+    """A square of 40 to 100 % of the picture's shorter side, perhaps mirrored, as (size, size).
+
+    Of a small picture at least 70 %: what is enlarged looks unsharp.
+    """
     with Image.open(path) as picture:
         if min(picture.size) < size // 2:
             width, height = picture.size
             raise ValueError(f"{width}x{height} is too small, {size // 2} pixels are needed")
-        picture.draft("L", (size, size))  # lets JPEG decode at half or a quarter of its size
+        least = min(max(size / min(picture.size), 0.4), 0.7)
+        # lets JPEG decode at half or a quarter of its size
+        picture.draft("L", (round(size / least), round(size / least)))
         grey = picture.convert("L")
-    side = rng.uniform(0.7, 1.0) * min(grey.size)
+    side = rng.uniform(least, 1.0) * min(grey.size)
     left, top = (rng.uniform(0, length - side) for length in grey.size)
     box = (left, top, left + side, top + side)
     grey = grey.resize((size, size), Image.Resampling.LANCZOS, box, reducing_gap=3.0)

@@ -51,6 +51,8 @@ class SensorSettings:
     """Draw the ON threshold log-uniformly from here instead, OFF within 10 % of it."""
     refractory: float = 1e-3
     """Seconds after an event in which a pixel stays silent."""
+    refractory_range: tuple[float, float] | None = None
+    """Draw it log-uniformly from here instead, once for a sequence."""
     mismatch: float = 0.0
     """Standard deviation of each pixel's own thresholds, in log intensity; about 0.03 in life."""
     noise: tuple[float, float] = (0.0, 0.0)
@@ -66,6 +68,7 @@ class SensorSettings:
 
 
 FAULTY = SensorSettings(
+    refractory_range=(1e-4, 1e-3),
     mismatch=0.03,
     noise=(0.1, 10.0),
     leak=(0.01, 0.5),
@@ -117,7 +120,7 @@ def random_sensor(
     """The sensor of a sequence: thresholds and faults, drawn once."""
     shape = height, width
     number_key, spread_key, mismatch_key, drift_key, noise_key = jax.random.split(key, 5)
-    numbers = iter(jax.random.uniform(number_key, (5,)))
+    numbers = iter(jax.random.uniform(number_key, (6,)))
     spread = jax.random.normal(spread_key, (2,))
 
     def log_uniform(bounds):
@@ -143,10 +146,13 @@ def random_sensor(
         if settings.hot[1]:
             rate = 10.0 * 50.0**rate * jnp.where(sign < 0.5, on, -off)
             drift = jnp.where(chance < log_uniform(settings.hot), rate, drift)
+    refractory = jnp.float32(settings.refractory) if settings.refractory else None
+    if settings.refractory_range is not None:
+        refractory = log_uniform(settings.refractory_range)
     return Sensor(
         on=on,
         off=off,
-        refractory=jnp.int32(settings.refractory * 1e6 * TICKS) if settings.refractory else None,
+        refractory=None if refractory is None else (refractory * 1e6 * TICKS).astype(jnp.int32),
         drift=drift,
         noise=log_uniform(settings.noise) if settings.noise[1] else None,
         cutoff=jnp.stack([log_uniform(settings.cutoff), jnp.float32(settings.cutoff_dark)])
@@ -322,6 +328,19 @@ class Simulation(NamedTuple):
     visible: jax.Array  # (T, B, H, W) bool, where the displacement leads to a visible place
 
 
+def _draw(scenes: Scene, seconds: jax.Array, *, height: int, width: int) -> jax.Array:
+    """B scenes, (B,) -> (B, H, W)."""
+    draw = partial(render, height=height, width=width)
+    return jax.vmap(draw)(scenes, seconds).image
+
+
+def first_states(
+    sensors: Sensor, scenes: Scene, times: jax.Array, *, height: int, width: int
+) -> SensorState:
+    """The states of B sensors that see B scenes for the first time at (B,) int32 microseconds."""
+    return jax.vmap(first_state)(sensors, _draw(scenes, 1e-6 * times, height=height, width=width))
+
+
 @partial(jax.jit, static_argnames=("height", "width", "renderings"))
 def simulate(
     sensors: Sensor,
@@ -340,11 +359,11 @@ def simulate(
     renderings: so many in each window, equally spaced. Nothing moves by more than half a pixel
     from one to the next where windows last at most renderings / 2 / scene.speed seconds.
     """
-    draw = jax.vmap(lambda scene, t: render(scene, t, height=height, width=width).image)
+    draw = partial(_draw, height=height, width=width)
     move = jax.vmap(partial(flow, height=height, width=width))
     shape = bounds.shape[1], height, width
     if state is None:
-        state = jax.vmap(first_state)(sensors, draw(scenes, 1e-6 * bounds[0]))
+        state = first_states(sensors, scenes, bounds[0], height=height, width=width)
 
     # The renderings of a window are a loop of their own: unrolled, they compile twice as long.
     span = min(-(-(BINS - 1) // renderings) + 2, BINS)  # bins that the votes of one can reach

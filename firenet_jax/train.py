@@ -1,5 +1,9 @@
 """Simulated sequences -> parameters: one jitted step simulates, scans, and updates.
 
+With `chain` more than 1 the steps of a chain see one long sequence, one part after the other
+(truncated back-propagation): simulation and network go on from the states where the last step
+left them, gradients stop there.
+
 Step n is a function of the seed, n and the state alone, so a run that was interrupted and resumed
 is the run that was not. A run is a folder:
 
@@ -31,7 +35,14 @@ from firenet_jax.events import logger
 from firenet_jax.losses import Loss, sequence_loss
 from firenet_jax.network import State, Weights, initial_params, initial_state, step
 from firenet_jax.scenes import SceneSettings, load_textures
-from firenet_jax.sensor import FAULTY, SensorSettings, Simulation, sequences
+from firenet_jax.sensor import (
+    FAULTY,
+    SensorSettings,
+    SensorState,
+    first_states,
+    random_setups,
+    simulate,
+)
 from firenet_jax.tensors import normalise
 
 TEXTURE = 256  # pixels on a side of a texture
@@ -55,6 +66,8 @@ class Train:
     """Folder of pictures for textures (default: scikit-image's photographs, and drawn ones)."""
     textures: int = 256
     """How many textures to cut from them."""
+    procedural: float = 0.25
+    """Part of the textures that is drawn instead."""
     steps: int = 20_000
     """Updates of the parameters."""
     batch: int = 2
@@ -62,9 +75,14 @@ class Train:
     crop: int = 96
     """Height and width of the sequences, in pixels."""
     windows: int = 21
-    """Windows in a sequence, L + 1 in the paper."""
+    """Windows in a step, L + 1 in the paper."""
+    chain: int = 1
+    """Steps through which a sequence goes on, its state carried from one to the next."""
     renderings: int = 5
     """Renderings in a window."""
+    motion: tuple[float, float] = (1.25, 2.5)
+    """Pixels by which the fastest point moves in a window, at most half of the renderings; drawn
+    log-uniformly for a sequence."""
     learning_rate: float = 1e-3
     """Greatest rate of Adam, after warming up; it then falls to a hundredth along a cosine."""
     warmup: int = 200
@@ -88,7 +106,17 @@ class Train:
     sensor: SensorSettings = dataclasses.replace(FAULTY, threshold_range=(0.1, 0.6))
 
     def __post_init__(self):
-        for name in ("textures", "steps", "batch", "crop", "renderings", "learning_rate", "clip"):
+        positive = (
+            "textures",
+            "steps",
+            "batch",
+            "crop",
+            "chain",
+            "renderings",
+            "learning_rate",
+            "clip",
+        )
+        for name in positive:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}, but must be more than 0")
         if not self.loss.l0 < self.windows <= self.loss.L + 1:
@@ -106,6 +134,7 @@ class TrainState(NamedTuple):
     params: Any
     optimiser: Any
     step: jax.Array  # () int32
+    carried: tuple[SensorState, State] | None  # within a chain
 
 
 def optimiser(settings: Train) -> optax.GradientTransformation:
@@ -128,32 +157,76 @@ def initial_train_state(settings: Train) -> TrainState:
                 "them: start from other weights, or from none"
             )
         params = jax.tree.map(jnp.asarray, weights.params)
-    return TrainState(params, optimiser(settings).init(params), jnp.int32(0))
+    carried = None
+    if settings.chain > 1:
+        setups = jax.eval_shape(
+            lambda key: _setups(key, jnp.zeros((1, TEXTURE, TEXTURE)), settings, 1),
+            jax.random.key(0),
+        )
+        carried = jax.eval_shape(lambda *setups: _fresh(*setups, settings), *setups)
+        carried = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), carried)
+    return TrainState(params, optimiser(settings).init(params), jnp.int32(0), carried)
 
 
-def simulated(key: jax.Array, textures: jax.Array, settings: Train) -> Simulation:
-    return sequences(
+def _setups(key: jax.Array, textures: jax.Array, settings: Train, chain: int):
+    """Sensors, scenes and bounds of all windows of a chain."""
+    return random_setups(
         key,
         textures,
         batch=settings.batch,
-        windows=settings.windows,
+        windows=chain * settings.windows,
         height=settings.crop,
         width=settings.crop,
         renderings=settings.renderings,
+        motion=settings.motion,
         scene=settings.scene,
         sensor=settings.sensor,
     )
 
 
-def images_of(params, tensors: jax.Array, settings: Train) -> jax.Array:
-    """Event tensors (T, B, H, W, 5), not normalised -> images (T, B, H, W), from a zero state."""
+def _fresh(sensors, scenes, bounds, settings: Train) -> tuple[SensorState, State]:
+    """What a sequence starts from."""
+    size = settings.crop, settings.crop
+    seen = first_states(sensors, scenes, bounds[0], height=size[0], width=size[1])
+    return seen, initial_state(settings.batch, *size)
+
+
+def _data(key, textures, settings: Train, state: TrainState | None = None):
+    """Simulation of a step, the states of sensor and network before it, whether those are warm.
+
+    Without a state: of a sequence on its own.
+    """
+    chain = 1 if state is None else settings.chain
+    part = 0 if chain == 1 else state.step % chain
+    sensors, scenes, bounds = _setups(key, textures, settings, chain)
+    seen, remembered = _fresh(sensors, scenes, bounds, settings)
+    warm = False
+    if chain > 1:
+        warm = part > 0
+        choose = partial(jnp.where, warm)
+        seen, remembered = jax.tree.map(choose, state.carried, (seen, remembered))
+        first = part * settings.windows
+        bounds = jax.lax.dynamic_slice_in_dim(bounds, first, settings.windows + 1)
+    size = {"height": settings.crop, "width": settings.crop}
+    seen, data = simulate(sensors, scenes, bounds, seen, renderings=settings.renderings, **size)
+    return data, seen, remembered, warm
+
+
+def images_of(
+    params, tensors: jax.Array, settings: Train, state: State | None = None
+) -> tuple[State, jax.Array]:
+    """Event tensors (T, B, H, W, 5), not normalised -> last state, images (T, B, H, W).
+
+    state: before the first window; None is the zero state.
+    """
     run = partial(step, dtype=jnp.bfloat16 if settings.bfloat16 else jnp.float32)
     run = jax.checkpoint(run) if settings.remat else run
 
     def body(state: State, tensor: jax.Array):
         return run(params, state, tensor)
 
-    return jax.lax.scan(body, initial_state(*tensors.shape[1:4]), normalise(tensors))[1]
+    state = initial_state(*tensors.shape[1:4]) if state is None else state
+    return jax.lax.scan(body, state, normalise(tensors))
 
 
 @partial(jax.jit, static_argnames="settings", donate_argnames="state")
@@ -161,24 +234,28 @@ def train_step(
     state: TrainState, key: jax.Array, textures: jax.Array, settings: Train
 ) -> tuple[TrainState, dict[str, jax.Array]]:
     """(state, the run's key, textures (N, S, S)) -> (state, losses): simulate, scan, update."""
-    data = simulated(jax.random.fold_in(key, state.step), textures, settings)
+    key = jax.random.fold_in(key, state.step // settings.chain)
+    data, seen, remembered, warm = _data(key, textures, settings, state)
 
     def loss_of(params):
-        images = images_of(params, data.tensors, settings)
-        return sequence_loss(images, data.images, data.displacement, data.visible, settings.loss)
+        last, images = images_of(params, data.tensors, settings, remembered)
+        truth = data.images, data.displacement, data.visible
+        loss, terms = sequence_loss(images, *truth, settings.loss, warm)
+        return loss, (terms, last)
 
-    (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params)
+    (loss, (terms, last)), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params)
     updates, optimised = optimiser(settings).update(gradient, state.optimiser, state.params)
     params = optax.apply_updates(state.params, updates)
     terms = {"loss": loss, "gradient": optax.tree.norm(gradient), **terms}
-    return TrainState(params, optimised, state.step + 1), terms
+    carried = (seen, last) if settings.chain > 1 else None
+    return TrainState(params, optimised, state.step + 1, carried), terms
 
 
 @partial(jax.jit, static_argnames="settings")
 def validate(params, key: jax.Array, textures: jax.Array, settings: Train) -> dict:
     """Losses and metrics of one fixed batch; metrics over its images from l0 on, clipped."""
-    data = simulated(key, textures, settings)
-    images = images_of(params, data.tensors, settings)
+    data = _data(key, textures, settings)[0]
+    images = images_of(params, data.tensors, settings)[1]
     loss, terms = sequence_loss(images, data.images, data.displacement, data.visible, settings.loss)
     shown, truths = jnp.clip(images[settings.loss.l0 :], 0, 1), data.images[settings.loss.l0 :]
     return {
@@ -234,9 +311,13 @@ def textures_of(settings: Train) -> tuple[jax.Array, jax.Array]:
     The others are cut anew, but from the same pictures: they choose between the steps of a run;
     how good a network is on pictures it never saw they do not tell.
     """
-    training = load_textures(settings.images, settings.textures, TEXTURE, settings.seed)
-    others = load_textures(settings.images, 32, TEXTURE, settings.seed + 1)
-    return jnp.asarray(training), jnp.asarray(others)
+
+    def load(count, seed):
+        return jnp.asarray(
+            load_textures(settings.images, count, TEXTURE, seed, settings.procedural)
+        )
+
+    return load(settings.textures, settings.seed), load(32, settings.seed + 1)
 
 
 class Log:

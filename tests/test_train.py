@@ -79,7 +79,7 @@ def test_remat_and_bfloat16_change_little(tmp_path):
     tensors = jax.random.normal(jax.random.key(1), (3, 1, 16, 16, 5))
 
     def gradient(settings):
-        return jax.grad(lambda params: (images_of(params, tensors, settings) ** 2).sum())(params)
+        return jax.grad(lambda params: (images_of(params, tensors, settings)[1] ** 2).sum())(params)
 
     exact, again = gradient(settings), gradient(replace(settings, remat=True))
     rough = gradient(replace(settings, bfloat16=True))
