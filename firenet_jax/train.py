@@ -1,4 +1,4 @@
-"""Simulated sequences -> parameters: one jitted step simulates, scans, and updates.
+"""Simulated sequences, or files of them -> parameters: a jitted step simulates, scans, updates.
 
 With `chain` more than 1 the steps of a chain see one long sequence, one part after the other
 (truncated back-propagation): simulation and network go on from the states where the last step
@@ -9,13 +9,21 @@ is the run that was not. A run is a folder:
 
     settings.json     what was asked for
     log.jsonl         one line for each logged step: losses, seconds
+    tensorboard/      the same as curves, and the pictures
+    pictures/         each validation's: events, image, truth
     checkpoints/      the whole state (orbax), the newest two
     weights.npz       the parameters that did best on the validation sequences so far
+    last.npz          those of the last validation
+
+The sequences of a batch are dealt out to all devices of all processes; what is computed does not
+depend on how many these are.
 """
 
 import dataclasses
+import itertools
 import json
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,18 +35,26 @@ import numpy as np
 import optax
 import orbax.checkpoint as ocp
 import tyro
+from jax.experimental import multihost_utils
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+from PIL import Image
+from tensorboardX import SummaryWriter
 from tqdm import tqdm
 
 from firenet_jax import metrics
+from firenet_jax.batches import NOTHING, Augment, batches, split
 from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.events import logger
 from firenet_jax.losses import Loss, sequence_loss
 from firenet_jax.network import State, Weights, initial_params, initial_state, step
+from firenet_jax.pictures import event_pictures
 from firenet_jax.scenes import SceneSettings, load_textures
 from firenet_jax.sensor import (
     FAULTY,
     SensorSettings,
     SensorState,
+    Simulation,
     first_states,
     random_setups,
     simulate,
@@ -46,6 +62,7 @@ from firenet_jax.sensor import (
 from firenet_jax.tensors import normalise
 
 TEXTURE = 256  # pixels on a side of a texture
+VALIDATION = 8  # batches
 
 
 @dataclass(frozen=True)
@@ -55,6 +72,7 @@ class Train:
     Examples:
       firenet train -o run
       firenet train -o run --images coco/train2017 --steps 100000
+      firenet simulate -o set --sequences 1000  and then  firenet train -o run --data set
       firenet train -o tuned --weights firenet.npz --learning-rate 1e-4
     """
 
@@ -62,6 +80,9 @@ class Train:
     """Folder of the run; an interrupted run in it goes on."""
     weights: Annotated[Path | None, tyro.conf.arg(aliases=["-c"])] = None
     """Start from these weights instead of random ones."""
+    data: Path | None = None
+    """Folder of HDF5 sequences to train on (`firenet simulate`, or downloaded) instead of
+    simulating as it goes; settings of textures, renderings, scenes and sensors play no part."""
     images: Path | None = None
     """Folder of pictures for textures (default: scikit-image's photographs, and drawn ones)."""
     textures: int = 256
@@ -100,8 +121,16 @@ class Train:
     validate_every: int = 500
     """Steps between two validations."""
     save_every: float = 120.0
-    """Seconds between two checkpoints."""
+    """Seconds between two checkpoints, which are made after a line of the log."""
+    coordinator: str | None = None
+    """host:port of process 0, where several processes train together; start each with this."""
+    processes: int | None = None
+    """How many processes."""
+    process: int | None = None
+    """Which one this is, from 0."""
     loss: Loss = Loss()
+    augment: Augment = Augment()
+    """What happens to sequences from files."""
     scene: SceneSettings = SceneSettings()
     sensor: SensorSettings = dataclasses.replace(FAULTY, threshold_range=(0.1, 0.6))
 
@@ -126,6 +155,9 @@ class Train:
             )
         if self.warmup >= self.steps:
             raise ValueError(f"warmup is {self.warmup} steps of {self.steps}: use fewer")
+        together = [self.coordinator, self.processes, self.process]
+        if None in together and together != [None] * 3:
+            raise ValueError("several processes need all of coordinator, processes and process")
 
 
 class TrainState(NamedTuple):
@@ -156,16 +188,60 @@ def initial_train_state(settings: Train) -> TrainState:
                 f"{settings.weights} expects tensors that are not normalised, training normalises "
                 "them: start from other weights, or from none"
             )
-        params = jax.tree.map(jnp.asarray, weights.params)
+        params = weights.params
     carried = None
     if settings.chain > 1:
         setups = jax.eval_shape(
-            lambda key: _setups(key, jnp.zeros((1, TEXTURE, TEXTURE)), settings, 1),
+            partial(_setups, settings=settings, chain=1),
             jax.random.key(0),
+            jnp.zeros((1, TEXTURE, TEXTURE)),
         )
-        carried = jax.eval_shape(lambda *setups: _fresh(*setups, settings), *setups)
-        carried = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), carried)
-    return TrainState(params, optimiser(settings).init(params), jnp.int32(0), carried)
+        carried = jax.eval_shape(partial(_fresh, settings=settings), *setups)
+        carried = carried if settings.data is None else (None, carried[1])
+        carried = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), carried)
+        carried = jax.device_put(carried, shared(BATCH))
+    state = params, optimiser(settings).init(params), np.int32(0)
+    return TrainState(*everywhere(state), carried)
+
+
+# ---- Many devices: each has some of the sequences of a batch, and all of the parameters
+
+BATCH = P("devices")  # the first axis of a state
+TIME_BATCH = P(None, "devices")  # the second one of what comes in windows
+
+
+def devices() -> Mesh:
+    """All devices of all processes, in a row."""
+    return jax.make_mesh((jax.device_count(),), ("devices",), axis_types=(AxisType.Auto,))
+
+
+def shared(spec: P = P()) -> NamedSharding:
+    """How an array lies on the devices: whole on each of them, or split along its batch."""
+    return NamedSharding(devices(), spec)
+
+
+def everywhere(tree):
+    """Arrays of the host -> the same on all devices of all processes."""
+    return jax.device_put(jax.tree.map(np.asarray, tree), shared())
+
+
+def _keys(settings: Train) -> list[jax.Array]:
+    """The key of the training sequences, and those of the validation sequences."""
+
+    def keys():
+        training, validation = jax.random.split(jax.random.key(settings.seed + 1))
+        return [training, *jax.random.split(validation, VALIDATION)]
+
+    return jax.jit(keys, out_shardings=shared())()  # devices of others take keys in no other way
+
+
+def _on_each_device(function, in_specs, out_specs):
+    return jax.shard_map(
+        function, mesh=devices(), in_specs=in_specs, out_specs=out_specs, check_vma=False
+    )
+
+
+# ---- Simulation
 
 
 def _setups(key: jax.Array, textures: jax.Array, settings: Train, chain: int):
@@ -188,28 +264,39 @@ def _fresh(sensors, scenes, bounds, settings: Train) -> tuple[SensorState, State
     """What a sequence starts from."""
     size = settings.crop, settings.crop
     seen = first_states(sensors, scenes, bounds[0], height=size[0], width=size[1])
-    return seen, initial_state(settings.batch, *size)
+    return seen, initial_state(bounds.shape[1], *size)
 
 
-def _data(key, textures, settings: Train, state: TrainState | None = None):
-    """Simulation of a step, the states of sensor and network before it, whether those are warm.
+def _simulated(
+    key: jax.Array, textures: jax.Array, settings: Train, state: TrainState | None = None
+) -> tuple[Simulation, tuple[SensorState, State], jax.Array | bool]:
+    """A step's data, the states (sensor's after it, network's before it), whether these are warm.
 
-    Without a state: of a sequence on its own.
+    Without a TrainState: a sequence of its own.
     """
     chain = 1 if state is None else settings.chain
-    part = 0 if chain == 1 else state.step % chain
     sensors, scenes, bounds = _setups(key, textures, settings, chain)
-    seen, remembered = _fresh(sensors, scenes, bounds, settings)
-    warm = False
-    if chain > 1:
-        warm = part > 0
-        choose = partial(jnp.where, warm)
-        seen, remembered = jax.tree.map(choose, state.carried, (seen, remembered))
-        first = part * settings.windows
-        bounds = jax.lax.dynamic_slice_in_dim(bounds, first, settings.windows + 1)
-    size = {"height": settings.crop, "width": settings.crop}
-    seen, data = simulate(sensors, scenes, bounds, seen, renderings=settings.renderings, **size)
-    return data, seen, remembered, warm
+    part = jnp.int32(0) if chain == 1 else state.step % chain
+    carried = None if chain == 1 else state.carried
+
+    def one_device(sensors, scenes, bounds, carried, part):
+        seen, remembered = _fresh(sensors, scenes, bounds, settings)
+        if chain > 1:
+            choose = partial(jnp.where, part > 0)
+            seen, remembered = jax.tree.map(choose, carried, (seen, remembered))
+            first = part * settings.windows
+            bounds = jax.lax.dynamic_slice_in_dim(bounds, first, settings.windows + 1)
+        size = {"height": settings.crop, "width": settings.crop}
+        seen, data = simulate(sensors, scenes, bounds, seen, renderings=settings.renderings, **size)
+        return data, (seen, remembered)
+
+    specs = BATCH, BATCH, TIME_BATCH, BATCH, P()
+    on_each = _on_each_device(one_device, specs, (TIME_BATCH, BATCH))
+    data, states = on_each(sensors, scenes, bounds, carried, part)
+    return data, states, part > 0 if chain > 1 else False
+
+
+# ---- Steps
 
 
 def images_of(
@@ -229,62 +316,114 @@ def images_of(
     return jax.lax.scan(body, state, normalise(tensors))
 
 
-@partial(jax.jit, static_argnames="settings", donate_argnames="state")
-def train_step(
-    state: TrainState, key: jax.Array, textures: jax.Array, settings: Train
-) -> tuple[TrainState, dict[str, jax.Array]]:
-    """(state, the run's key, textures (N, S, S)) -> (state, losses): simulate, scan, update."""
-    key = jax.random.fold_in(key, state.step // settings.chain)
-    data, seen, remembered, warm = _data(key, textures, settings, state)
+def loss_of(params, data: Simulation, state: State | None, warm, settings: Train):
+    """(loss, (its terms, last state, images)) of all devices' sequences."""
 
-    def loss_of(params):
-        last, images = images_of(params, data.tensors, settings, remembered)
+    def one_device(params, data, state, warm):
+        last, images = images_of(params, data.tensors, settings, state)
         truth = data.images, data.displacement, data.visible
-        loss, terms = sequence_loss(images, *truth, settings.loss, warm)
-        return loss, (terms, last)
+        losses = sequence_loss(images, *truth, settings.loss, warm)
+        return jax.lax.pmean(losses, "devices"), (last, images)
 
-    (loss, (terms, last)), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params)
+    # A `warm` that is known, known it must stay: it is no argument of the program then.
+    known = isinstance(warm, bool)
+    function = partial(one_device, warm=warm) if known else one_device
+    specs = (P(), TIME_BATCH, BATCH) + (() if known else (P(),))
+    on_each = _on_each_device(function, specs, (P(), (BATCH, TIME_BATCH)))
+    (loss, terms), (last, images) = on_each(params, data, state, *(() if known else (warm,)))
+    return loss, (terms, last, images)
+
+
+def _updated(state: TrainState, data: Simulation, before: State | None, warm, settings: Train):
+    """(state, data, the network's state before it) -> (state, losses), the network's state."""
+    both = jax.value_and_grad(loss_of, has_aux=True)
+    (loss, (terms, last, _)), gradient = both(state.params, data, before, warm, settings)
     updates, optimised = optimiser(settings).update(gradient, state.optimiser, state.params)
     params = optax.apply_updates(state.params, updates)
     terms = {"loss": loss, "gradient": optax.tree.norm(gradient), **terms}
-    carried = (seen, last) if settings.chain > 1 else None
-    return TrainState(params, optimised, state.step + 1, carried), terms
+    return state._replace(params=params, optimiser=optimised, step=state.step + 1), terms, last
+
+
+@partial(jax.jit, static_argnames="settings", donate_argnames="state")
+def train_step(
+    state: TrainState, source: tuple[jax.Array, jax.Array] | Simulation, settings: Train
+) -> tuple[TrainState, dict[str, jax.Array]]:
+    """(state, source) -> (state, losses): make data, scan, update.
+
+    source: the run's key and textures (N, S, S), from which a step's sequences are simulated; or
+    data from files.
+    """
+    if isinstance(source, Simulation):
+        data, seen, warm = source, None, False
+        size = data.images.shape[1:]
+        before = initial_state(*size)
+        if settings.chain > 1:
+            warm = state.step % settings.chain > 0
+            before = jax.tree.map(partial(jnp.where, warm), state.carried[1], before)
+    else:
+        key, textures = source
+        key = jax.random.fold_in(key, state.step // settings.chain)
+        data, (seen, before), warm = _simulated(key, textures, settings, state)
+    state, terms, last = _updated(state, data, before, warm, settings)
+    return state._replace(carried=(seen, last) if settings.chain > 1 else None), terms
 
 
 @partial(jax.jit, static_argnames="settings")
-def validate(params, key: jax.Array, textures: jax.Array, settings: Train) -> dict:
-    """Losses and metrics of one fixed batch; metrics over its images from l0 on, clipped."""
-    data = _data(key, textures, settings)[0]
-    images = images_of(params, data.tensors, settings)[1]
-    loss, terms = sequence_loss(images, data.images, data.displacement, data.visible, settings.loss)
+def simulated(key: jax.Array, textures: jax.Array, settings: Train) -> Simulation:
+    """Sequences of their own, as long as a step's."""
+    return _simulated(key, textures, settings)[0]
+
+
+@partial(jax.jit, static_argnames="settings")
+def validate(params, data: Simulation, settings: Train):
+    """(losses and metrics of a batch, pictures of its first sequence), from a zero state.
+
+    Metrics are of the images from l0 on, clipped. Pictures: (T, H, W) the images, (T, H, W) the
+    truth, (T, H, W, 5) the event tensors.
+    """
+    before = initial_state(*data.images.shape[1:])
+    loss, (terms, _, images) = loss_of(params, data, before, False, settings)
     shown, truths = jnp.clip(images[settings.loss.l0 :], 0, 1), data.images[settings.loss.l0 :]
-    return {
+    scores = {
         "loss": loss,
         "temporal": terms.get("temporal", jnp.zeros(())),
         "mse": metrics.mse(shown, truths).mean(),
         "ssim": metrics.ssim(shown, truths).mean(),
     }
+    pictures = images[:, 0], data.images[:, 0], data.tensors[:, 0]
+    return scores, jax.lax.with_sharding_constraint(pictures, shared())
+
+
+# ---- Runs
 
 
 def run(settings: Train) -> None:
-    """Trains as the settings say, going on where an interrupted run stopped."""
+    """Trains as the settings say, going on where an interrupted run stopped.
+
+    Raises ValueError where the settings do not fit the folder, the weights or the devices.
+    """
+    if settings.coordinator is not None:
+        jax.distributed.initialize(settings.coordinator, settings.processes, settings.process)
+    if settings.batch % jax.device_count():
+        raise ValueError(
+            f"batch is {settings.batch}, but the sequences of a batch are dealt out to "
+            f"{jax.device_count()} devices: choose a multiple of that"
+        )
     folder = settings.output
     _same_settings(folder, settings)
-    training, others = textures_of(settings)
-    key, validation_key = jax.random.split(jax.random.key(settings.seed + 1))
-    validation_keys = jax.random.split(validation_key, 8)
     state = initial_train_state(settings)
     options = ocp.CheckpointManagerOptions(max_to_keep=2)
     with ocp.CheckpointManager((folder / "checkpoints").absolute(), options=options) as saved:
         if saved.latest_step() is not None:
             state = saved.restore(saved.latest_step(), args=ocp.args.StandardRestore(state))
             logger.warning("%s: going on after step %d", folder, state.step)
-        log = Log(folder / "log.jsonl", int(state.step))
-        best = log.best()
-        last_save, done = time.monotonic(), int(state.step)
-        with tqdm(total=settings.steps, initial=done, unit="step", disable=None) as progress:
+        done = int(state.step)
+        sources, validation = sources_of(settings, done)
+        log = Log(folder, done)
+        best, last_save = log.best(), time.monotonic()
+        with tqdm(total=settings.steps, initial=done, unit="step", disable=_bar()) as progress:
             while done < settings.steps:
-                state, terms = train_step(state, key, training, settings)
+                state, terms = train_step(state, next(sources), settings)
                 done += 1
                 progress.update()
                 if done % settings.log_every == 0 or done == settings.steps:
@@ -292,58 +431,136 @@ def run(settings: Train) -> None:
                     progress.set_postfix(loss=f"{terms['loss']:.3f}", refresh=False)
                     _check_finite(terms, state, folder)
                 if done % settings.validate_every == 0 or done == settings.steps:
-                    scores = [validate(state.params, k, others, settings) for k in validation_keys]
-                    means = jax.tree.map(lambda *values: np.mean(values), *scores)
+                    results = [validate(state.params, make(), settings) for make in validation]
+                    means = jax.tree.map(lambda *scores: np.mean(scores), *(r[0] for r in results))
                     means = log.write(done, "validation", means)
+                    log.show(done, results[0][1])
+                    weights = Weights(jax.tree.map(np.asarray, jax.device_get(state.params)), True)
                     if means["loss"] < best:
                         best = means["loss"]
-                        save_weights(folder / "weights.npz", Weights(_host(state.params), True))
-                    save_weights(folder / "last.npz", Weights(_host(state.params), True))
-                if time.monotonic() - last_save > settings.save_every or done == settings.steps:
+                        log.keep("weights.npz", weights)
+                    log.keep("last.npz", weights)
+                logged = done % settings.log_every == 0
+                if done == settings.steps or (logged and _due(last_save, settings)):
                     saved.save(done, args=ocp.args.StandardSave(state))
                     last_save = time.monotonic()
-    print(f"{folder / 'weights.npz'}: best validation loss {best:.4f} in {done} steps")
+        log.close()
+    if _first():
+        print(f"{folder / 'weights.npz'}: best validation loss {best:.4f} in {done} steps")
 
 
-def textures_of(settings: Train) -> tuple[jax.Array, jax.Array]:
-    """Textures to train on, and others to validate on.
+def _due(last_save: float, settings: Train) -> bool:
+    """Processes save together or not at all, so the first one's clock decides for all."""
+    due = time.monotonic() - last_save > settings.save_every
+    if jax.process_count() > 1:
+        due = bool(multihost_utils.broadcast_one_to_all(np.array(due)))
+    return due
 
-    The others are cut anew, but from the same pictures: they choose between the steps of a run;
-    how good a network is on pictures it never saw they do not tell.
+
+def _first() -> bool:
+    """Whether this is the process that writes and talks."""
+    return jax.process_index() == 0
+
+
+def _bar() -> bool | None:
+    """tqdm's `disable`: no bar but in the first process, and there none where nobody looks."""
+    return None if _first() else True
+
+
+def sources_of(settings: Train, done: int) -> tuple[Iterator, list[Callable[[], Simulation]]]:
+    """What `train_step` takes for the step after `done` and all later ones; validation batches.
+
+    Files to validate on are no files to train on (`batches.split`). Textures to validate on are
+    cut anew, but from the same pictures: they choose between the steps of a run; how good a
+    network is on pictures it never saw they do not tell.
     """
+    if settings.data is not None:
+        files, others = split(settings.data)
+        shape = {"batch": settings.batch, "windows": settings.windows, "crop": settings.crop}
+        chain, augment = settings.chain, settings.augment
+        training = batches(
+            files, **shape, chain=chain, augment=augment, seed=settings.seed, first=done
+        )
+        fixed = batches(others, **shape, augment=NOTHING, seed=settings.seed)
+        validation = [_dealt(next(fixed)) for _ in range(VALIDATION)]
+        fixed.close()
+        return map(_dealt, training), [partial(lambda data: data, data) for data in validation]
 
     def load(count, seed):
-        return jnp.asarray(
-            load_textures(settings.images, count, TEXTURE, seed, settings.procedural)
-        )
+        pictures = load_textures(settings.images, count, TEXTURE, seed, settings.procedural)
+        return everywhere(pictures)
 
-    return load(settings.textures, settings.seed), load(32, settings.seed + 1)
+    training, others = load(settings.textures, settings.seed), load(32, settings.seed + 1)
+    key, *keys = _keys(settings)
+    return itertools.repeat((key, training)), [
+        partial(simulated, key, others, settings) for key in keys
+    ]
+
+
+def _dealt(data: Simulation) -> Simulation:
+    """A batch, of which each device keeps its part; every process has read all of it."""
+    if jax.device_count() == 1:
+        return data
+
+    def dealt(whole):
+        whole = np.asarray(whole)
+        return jax.make_array_from_callback(whole.shape, shared(TIME_BATCH), whole.__getitem__)
+
+    return jax.tree.map(dealt, data)
 
 
 class Log:
-    """Lines of JSON; those beyond the checkpoint from which a run goes on are dropped."""
+    """A run's record: log.jsonl, TensorBoard, pictures, weights; written by the first process.
 
-    def __init__(self, path: Path, step: int):
-        self.path, self.start = path, time.monotonic()
-        lines = path.read_text().splitlines() if path.exists() else []
+    Lines beyond the checkpoint from which a run goes on are dropped.
+    """
+
+    def __init__(self, folder: Path, step: int):
+        self.path, self.start = folder / "log.jsonl", time.monotonic()
+        lines = self.path.read_text().splitlines() if self.path.exists() else []
         self.entries = [entry for line in lines if (entry := json.loads(line))["step"] <= step]
-        path.write_text("".join(json.dumps(entry) + "\n" for entry in self.entries))
+        self.board = None
+        if _first():
+            self.path.write_text("".join(json.dumps(entry) + "\n" for entry in self.entries))
+            self.board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
 
     def write(self, step: int, kind: str, values: dict) -> dict[str, float]:
         values = {name: float(value) for name, value in values.items()}
         entry = {"step": step, "kind": kind, **values, "seconds": time.monotonic() - self.start}
-        with self.path.open("a") as file:
-            file.write(json.dumps(entry) + "\n")
+        if self.board is not None:
+            with self.path.open("a") as file:
+                file.write(json.dumps(entry) + "\n")
+            for name, value in values.items():
+                self.board.add_scalar(f"{kind}/{name}", value, step)
         return values
+
+    def show(self, step: int, pictures: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+        """Three windows of `validate`'s pictures: events, image, truth, one window a row."""
+        if self.board is None:
+            return
+        images, truths, tensors = pictures
+        chosen = [len(images) * k // 3 - 1 for k in (1, 2, 3)]
+        grey = np.asarray(jnp.concatenate([images, truths], -1)[np.array(chosen)])
+        grey = np.round(255 * np.clip(grey, 0, 1)).astype(np.uint8)[..., None]
+        events = np.asarray(event_pictures(tensors[np.array(chosen)]))
+        sheet = np.concatenate([events, np.repeat(grey, 3, -1)], 2)  # (3, H, 3 W, 3)
+        sheet = sheet.reshape(-1, *sheet.shape[2:])
+        (self.path.parent / "pictures").mkdir(exist_ok=True)
+        Image.fromarray(sheet).save(self.path.parent / "pictures" / f"step_{step:07d}.png")
+        self.board.add_image("validation", sheet, step, dataformats="HWC")
+
+    def keep(self, name: str, weights: Weights) -> None:
+        if self.board is not None:
+            save_weights(self.path.parent / name, weights)
 
     def best(self) -> float:
         """The least validation loss so far."""
         losses = [entry["loss"] for entry in self.entries if entry["kind"] == "validation"]
         return min(losses, default=float("inf"))
 
-
-def _host(params):
-    return jax.tree.map(np.asarray, jax.device_get(params))
+    def close(self) -> None:
+        if self.board is not None:
+            self.board.close()
 
 
 def _check_finite(terms: dict[str, float], state: TrainState, folder: Path) -> None:
@@ -357,9 +574,11 @@ def _check_finite(terms: dict[str, float], state: TrainState, folder: Path) -> N
 def _same_settings(folder: Path, settings: Train) -> None:
     """Keeps the settings in the folder; raises ValueError if a run of others is there."""
     folder.mkdir(parents=True, exist_ok=True)
-    choices = {k: v for k, v in dataclasses.asdict(settings).items() if k != "output"}
+    where = {"output", "coordinator", "processes", "process"}  # not what is computed
+    choices = {k: v for k, v in dataclasses.asdict(settings).items() if k not in where}
     text = json.dumps(choices, default=str, indent=1)
     path = folder / "settings.json"
     if path.exists() and path.read_text() != text:
         raise ValueError(f"{folder} holds a run with other settings: choose another --output")
-    path.write_text(text)
+    if _first():
+        path.write_text(text)

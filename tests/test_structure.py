@@ -13,19 +13,22 @@ PACKAGE = Path(fj.__file__).parent
 
 # Left never imports right. Modules on one line do not import each other.
 LAYERS = [
-    ["events", "convolution", "pictures", "video", "overlap", "pytorch_file", "warp"],
-    ["readers", "windows", "network", "metrics", "scenes"],
+    ["events", "convolution", "pictures", "video", "overlap", "pytorch_file", "warp", "equalise"],
+    ["readers", "windows", "network", "metrics", "scenes", "lpips"],
     ["filters", "tensors", "checkpoint", "losses"],
     ["reconstruction", "sensor"],
-    ["info", "pipeline", "dataset", "train"],
+    ["baselines"],
+    ["info", "pipeline", "dataset", "batches"],
+    ["train"],
     ["demo"],
     ["cli"],
 ]
 # Each outside library enters by one door.
 DOORS = {
-    "flax": {"network"}, "optax": {"train"}, "orbax": {"train"}, "torch": set(),
-    "av": {"video", "dataset"}, "h5py": {"readers", "dataset"}, "pyarrow": {"readers"},
-    "faery": {"readers"}, "rosbags": {"readers"}, "hdf5plugin": {"readers"},
+    "flax": {"network", "baselines"}, "optax": {"train"}, "orbax": {"train"}, "torch": set(),
+    "av": {"video", "dataset"}, "h5py": {"readers", "dataset", "batches"}, "pyarrow": {"readers"},
+    "grain": {"batches"}, "faery": {"readers"}, "rosbags": {"readers"}, "hdf5plugin": {"readers"},
+    "skimage": {"equalise"},
 }  # fmt: skip
 
 

@@ -1,4 +1,8 @@
 import json
+import os
+import socket
+import subprocess
+import sys
 from dataclasses import replace
 
 import jax
@@ -8,9 +12,11 @@ import pytest
 
 from firenet_jax import train
 from firenet_jax.checkpoint import load_weights, save_weights
+from firenet_jax.dataset import Picture, write_sequence
+from firenet_jax.events import Events
 from firenet_jax.losses import Loss
 from firenet_jax.network import Weights, initial_params
-from firenet_jax.scenes import SceneSettings
+from firenet_jax.scenes import SceneSettings, load_textures
 from firenet_jax.train import Log, Train, images_of, initial_train_state, run, train_step
 
 
@@ -57,16 +63,79 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(tmp_path, monkeypatch, 
     jax.tree.map(np.testing.assert_array_equal, ours.params, theirs.params)
 
 
+TOGETHER = """
+import sys
+from pathlib import Path
+from firenet_jax.dataset import Picture, write_sequence
+from firenet_jax.events import Events
+from firenet_jax.losses import Loss
+from firenet_jax.scenes import SceneSettings, load_textures
+from firenet_jax.train import Train, run
+
+folder, chain, *where = sys.argv[1:]
+coordinator, processes, process = (where[0], int(where[1]), int(where[2])) if where else [None] * 3
+run(Train(Path(folder), steps=10, batch=4, crop=32, windows=3, warmup=1, textures=4, log_every=1,
+    validate_every=10, save_every=0.0, loss=Loss(l0=1), scene=SceneSettings(objects=0),
+    chain=int(chain), coordinator=coordinator, processes=processes, process=process))
+"""
+
+
+def start(folder, *arguments, devices=1):
+    environment = os.environ | {
+        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+        "JAX_PLATFORMS": "cpu",
+    }
+    command = [sys.executable, "-c", TOGETHER, str(folder), *map(str, arguments)]
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def finish(*processes):
+    try:
+        for process in processes:
+            _, errors = process.communicate(timeout=300)
+            assert process.returncode == 0, errors[-2000:]
+    finally:  # one that failed leaves the others waiting
+        for process in processes:
+            process.kill()
+            process.communicate()
+
+
+@pytest.mark.slow
+def test_four_devices_and_two_processes_learn_what_one_device_learns(tmp_path):
+    finish(start(tmp_path / "one", 2))
+    finish(start(tmp_path / "four", 2, devices=4))
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        address = f"localhost:{free.getsockname()[1]}"
+    two = [start(tmp_path / "two", 2, address, 2, process) for process in range(2)]
+    finish(*two)
+
+    one, four, two = (losses(tmp_path / name) for name in ("one", "four", "two"))
+    assert len(one) == 11
+    for others in (four, two):
+        for (step, kind, loss), other in zip(one, others, strict=True):
+            assert other[:2] == (step, kind)
+            assert other[2] == pytest.approx(loss, rel=1e-5), (step, kind)
+    for name in ("one", "four", "two"):
+        assert (tmp_path / name / "weights.npz").exists()
+
+
+def test_a_batch_that_devices_cannot_share_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(jax, "device_count", lambda: 3)
+    with pytest.raises(ValueError, match="dealt out to 3 devices"):
+        run(tiny(tmp_path))
+
+
 @pytest.mark.slow
 def test_learns_one_batch_by_heart(tmp_path):
     """The same sequences again and again: the loss must fall a long way."""
     settings = tiny(tmp_path, steps=60, warmup=5, learning_rate=3e-3)
-    textures = jnp.asarray(train.load_textures(None, 4, 64, 0, procedural=1.0))
+    textures = jnp.asarray(load_textures(None, 4, 64, 0, procedural=1.0))
     state, key, seen = initial_train_state(settings), jax.random.key(0), []
     train_step.clear_cache()
     for _ in range(60):
         step = state.step
-        state, terms = train_step(state._replace(step=jnp.int32(0)), key, textures, settings)
+        state, terms = train_step(state._replace(step=jnp.int32(0)), (key, textures), settings)
         state = state._replace(step=step + 1)
         seen.append(float(terms["loss"]))
     assert np.mean(seen[-5:]) < 0.6 * np.mean(seen[:5])
@@ -103,11 +172,11 @@ def test_weights_that_expect_other_tensors_are_refused(tmp_path):
 
 
 def test_the_log_forgets_what_comes_after_the_checkpoint(tmp_path):
-    log = Log(tmp_path / "log.jsonl", 0)
+    log = Log(tmp_path, 0)
     for step in range(1, 5):
         log.write(step, "validation", {"loss": jnp.float32(10 - step)})
-    assert [entry["step"] for entry in Log(tmp_path / "log.jsonl", 2).entries] == [1, 2]
-    assert Log(tmp_path / "log.jsonl", 2).best() == 8
+    assert [entry["step"] for entry in Log(tmp_path, 2).entries] == [1, 2]
+    assert Log(tmp_path, 2).best() == 8
 
 
 @pytest.mark.parametrize(
@@ -121,3 +190,33 @@ def test_the_log_forgets_what_comes_after_the_checkpoint(tmp_path):
 def test_impossible_settings(tmp_path, choice, message):
     with pytest.raises(ValueError, match=message):
         tiny(tmp_path, **choice)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("chain", [1, 2])
+def test_trains_on_files_and_resumes(tmp_path, chain):
+    """Files instead of simulation, through the same loop, and killed on the way."""
+    rng = np.random.default_rng(0)
+    for n in range(2):
+        t = np.sort(rng.integers(0, 200_000, 5000))
+        columns = rng.integers(0, 32, (2, 5000)), rng.random(5000) < 0.5
+        pictures = [
+            Picture(k * 10_000, rng.integers(0, 256, (32, 32), np.uint8), np.zeros((2, 32, 32)))
+            for k in range(20)
+        ]
+        events = Events.of(t, *columns[0], columns[1])
+        (tmp_path / "set").mkdir(exist_ok=True)
+        write_sequence(tmp_path / "set" / f"{n}.h5", [events], pictures, height=32, width=32)
+    choices = {"data": tmp_path / "set", "chain": chain, "steps": 4}
+    run(tiny(tmp_path / "whole", **choices))
+    assert [step for step, kind, _ in losses(tmp_path / "whole") if kind == "train"] == [1, 2, 3, 4]
+
+    settings = tiny(tmp_path / "parts", **choices)
+    state, sources = initial_train_state(settings), train.sources_of(settings, 0)[0]
+    seen = []
+    for number in range(4):
+        if number == 3:
+            sources = train.sources_of(settings, 3)[0]
+        state, terms = train_step(state, next(sources), settings)
+        seen.append(float(terms["loss"]))
+    assert seen == [loss for _, kind, loss in losses(tmp_path / "whole") if kind == "train"]
