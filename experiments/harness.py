@@ -17,13 +17,19 @@ import jax
 RESULTS = Path(__file__).parent / "results"
 
 
-def interleaved(methods: dict[str, Callable[[], object]], runs: int) -> dict[str, list[float]]:
-    """Seconds of each run of each method, which must return when the work is done."""
+def interleaved(
+    methods: dict[str, Callable[[], object]], runs: int, rest: float = 0.0
+) -> dict[str, list[float]]:
+    """Seconds of each run of each method, which must return when the work is done.
+
+    rest: seconds to wait before each run, where the threads of the method before may spin on.
+    """
     for method in methods.values():  # compilation, caches
         method()
     seconds: dict[str, list[float]] = {name: [] for name in methods}
     for _ in range(runs):
         for name, method in methods.items():
+            time.sleep(rest)
             start = time.perf_counter()
             method()
             seconds[name].append(time.perf_counter() - start)
@@ -43,6 +49,12 @@ def table(seconds: dict[str, list[float]], base: str) -> list[dict]:
         print(f"{name:34} {row['median_ms']:10.2f} {row['min_ms']:9.2f} {row['max_ms']:9.2f} "
               f"{row['ratio']:14.2f}")  # fmt: skip
     return rows
+
+
+def on_this_device(name: str) -> str:
+    """The name of a result, which elsewhere than on a CPU tells the kind of device."""
+    backend = jax.default_backend()
+    return name if backend == "cpu" else f"{name}_{backend}"
 
 
 def save(name: str, results: dict) -> None:

@@ -9,10 +9,12 @@ the former and 20 times faster than numpy.add.at.
 """
 
 import argparse
+from functools import partial
 
 import numpy as np
 import torch
 from harness import interleaved, save, table
+from pytorch_firenet import voxelise_lean, voxelise_original
 
 from firenet_jax.events import Events
 from firenet_jax.tensors import pack, voxelise
@@ -23,42 +25,6 @@ HEIGHT, WIDTH, BINS = 480, 640, 5
 def ours(events: Events):
     packed = pack([[events]])
     return voxelise(packed, height=HEIGHT, width=WIDTH).block_until_ready()
-
-
-def torch_original(events: Events):
-    """rpg_e2vid's steps in our words: (N, 4) float64 rows, time scaled, two masked index_add_."""
-    with torch.no_grad():
-        columns = [events.t.astype(np.float64), events.x, events.y, events.p]
-        rows = torch.from_numpy(np.stack(columns, axis=1))
-        grid = torch.zeros(BINS * HEIGHT * WIDTH)
-        times = (BINS - 1) * (rows[:, 0] - rows[0, 0]) / (rows[-1, 0] - rows[0, 0])
-        x, y = rows[:, 1].long(), rows[:, 2].long()
-        polarity = rows[:, 3].float()
-        polarity[polarity == 0] = -1
-        lower = torch.floor(times)
-        share = (times - lower).float()
-        lower = lower.long()
-        for bins, votes in ((lower, polarity * (1 - share)), (lower + 1, polarity * share)):
-            valid = (bins >= 0) & (bins < BINS)
-            place = x[valid] + y[valid] * WIDTH + bins[valid] * WIDTH * HEIGHT
-            grid.index_add_(0, place, votes[valid])
-        return grid.view(BINS, HEIGHT, WIDTH)
-
-
-def torch_lean(events: Events):
-    """As few passes and bytes as PyTorch needs: one spare plane takes the votes past the end."""
-    with torch.no_grad():
-        t = torch.from_numpy(events.t)
-        times = (t - t[0]).to(torch.float32) * ((BINS - 1) / float(t[-1] - t[0]))
-        lower = times.floor()
-        share = times - lower
-        polarity = torch.from_numpy(events.p).to(torch.float32).mul_(2).sub_(1)
-        place = torch.from_numpy(events.y).int() * WIDTH + torch.from_numpy(events.x)
-        place += lower.int() * (WIDTH * HEIGHT)
-        grid = torch.zeros((BINS + 1) * HEIGHT * WIDTH)
-        grid.index_add_(0, place, polarity * (1 - share))
-        grid.index_add_(0, place + WIDTH * HEIGHT, polarity * share)
-        return grid.view(BINS + 1, HEIGHT, WIDTH)[:BINS]
 
 
 def numpy_add_at(events: Events):
@@ -89,8 +55,8 @@ def main():
     )
     methods = {
         "ours": ours,
-        "torch index_add_ (original steps)": torch_original,
-        "torch index_add_ (leanest)": torch_lean,
+        "torch index_add_ (original steps)": partial(voxelise_original, height=HEIGHT, width=WIDTH),
+        "torch index_add_ (leanest)": partial(voxelise_lean, height=HEIGHT, width=WIDTH),
         "numpy.add.at": numpy_add_at,
     }
     expected = np.moveaxis(numpy_add_at(events), 0, -1)

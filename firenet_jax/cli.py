@@ -1,4 +1,4 @@
-"""Command line -> one command: firenet demo | reconstruct | info | simulate | train | convert.
+"""Command line -> one command: firenet demo | reconstruct | info | train | evaluate and others.
 
 A command is a frozen dataclass of settings and a `run(settings)` beside it, in a module that is
 imported only when the command is named: `firenet --help` loads no jax.
@@ -19,6 +19,7 @@ COMMANDS = {
     "info": ("firenet_jax.info", "Info", "what a recording holds"),
     "simulate": ("firenet_jax.dataset", "Simulate", "training data, or a video file -> events"),
     "train": ("firenet_jax.train", "Train", "simulated sequences -> weights"),
+    "evaluate": ("firenet_jax.evaluate", "Evaluate", "methods beside camera frames -> report"),
     "convert": ("firenet_jax.checkpoint", "Convert", "PyTorch checkpoint -> weights.npz"),
 }
 

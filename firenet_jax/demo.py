@@ -25,7 +25,14 @@ from firenet_jax.network import Weights, initial_state
 from firenet_jax.overlap import ahead
 from firenet_jax.pictures import Display, display, event_pictures, initial_display_state
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.scenes import Scene, SceneSettings, load_textures, photographs, random_scene
+from firenet_jax.scenes import (
+    HELD_OUT,
+    Scene,
+    SceneSettings,
+    load_textures,
+    photographs,
+    random_scene,
+)
 from firenet_jax.sensor import FAULTY, Sensor, SensorSettings, random_sensor, simulate
 from firenet_jax.video import check_output, open_writer
 
@@ -125,10 +132,8 @@ def make_scene(settings: Demo, height: int, width: int) -> tuple[Sensor, Scene]:
     """One sensor and one scene, each with a leading axis of 1. The fastest point moves as fast as
     the renderings of a window allow, which suits the network too."""
     scene_key, sensor_key = jax.random.split(jax.random.key(settings.seed))
-    # Photographs show best what a reconstruction is worth.
-    textures = load_textures(
-        count=16, size=320, seed=settings.seed, procedural=0.0 if photographs() else 1.0
-    )
+    # Photographs show best what a reconstruction is worth, those that no network here trained on.
+    textures = load_textures(photographs(HELD_OUT), count=16, size=320, seed=settings.seed)
     scene = random_scene(
         scene_key,
         jnp.asarray(textures),

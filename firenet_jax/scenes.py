@@ -608,7 +608,7 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", "
 
 
 def load_textures(
-    folder: str | Path | None = None,
+    pictures: str | Path | list[Path] | None = None,
     count: int = 64,
     size: int = 256,
     seed: int = 0,
@@ -616,19 +616,22 @@ def load_textures(
 ) -> np.ndarray:
     """Pictures -> textures (count, size, size) float32 in [0, 1], grey, cut at random.
 
-    folder: of pictures (searched with its subfolders; .jpg, .png and others), without those of
-    `HELD_OUT`, known by their names; only as many as are asked for are opened. None: the
-    photographs that come with scikit-image, where installed.
+    pictures: a folder of them (searched with its subfolders; .jpg, .png and others), without
+    those of `HELD_OUT`, known by their names; or a list of files; only as many as are asked for
+    are opened. None: the photographs that come with scikit-image.
     procedural: part of the textures that is drawn instead (`PROCEDURAL`); None: none of them
-    where a folder is named, else a quarter.
-    Raises ValueError where the folder holds no picture that can be used.
+    where pictures are named, else a quarter.
+    Raises ValueError where no picture can be used.
     """
     rng = np.random.default_rng(seed)
     if procedural is None:
-        procedural = 0.25 if folder is None else 0.0
-    paths = photographs() if folder is None else _pictures(Path(folder))
+        procedural = 0.25 if pictures is None else 0.0
+    if pictures is None:
+        paths = photographs()
+    else:
+        paths = pictures if isinstance(pictures, list) else _pictures(Path(pictures))
     drawn = round(procedural * count) if paths else count
-    textures = _cuttings(rng, paths, count - drawn, size, folder) if count > drawn else []
+    textures = _cuttings(rng, paths, count - drawn, size, pictures) if count > drawn else []
     kinds = list(PROCEDURAL.values())
     textures += [kinds[k % len(kinds)](rng, size) for k in range(drawn)]
     return np.stack(textures).astype(np.float32)
@@ -663,14 +666,14 @@ def _pictures(folder: Path) -> list[Path]:
     return sorted(found)
 
 
-def _cuttings(rng, paths: list[Path], count: int, size: int, folder) -> list[np.ndarray]:
+def _cuttings(rng, paths: list[Path], count: int, size: int, source) -> list[np.ndarray]:
     """Random squares of random pictures, each picture once before any comes again."""
     cuttings, usable = [], list(paths)
     problem = ""
     while len(cuttings) < count:
         if not usable:
             raise ValueError(
-                f"{folder or 'scikit-image'}: none of {len(paths)} pictures can be used for "
+                f"{source or 'scikit-image'}: none of {len(paths)} pictures can be used for "
                 f"textures of {size} pixels; the last: {problem}"
             )
         chosen = rng.permutation(len(usable))[: count - len(cuttings)]

@@ -3,15 +3,37 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import references
+from jax.extend.core import jaxprs_in_params
 
 from firenet_jax.checkpoint import convert
-from firenet_jax.network import Weights, initial_params, initial_state, step
+from firenet_jax.network import Weights, initial_params, initial_state, multiply_adds, step
 from firenet_jax.reconstruction import reconstruct
 
 
 def test_has_the_papers_number_of_parameters():
     params = initial_params(jax.random.key(0))
     assert sum(leaf.size for leaf in jax.tree.leaves(params)) == 37_777
+
+
+def convolutions(jaxpr):
+    """All convolutions of a traced program, those of functions called in it too."""
+    for equation in jaxpr.eqns:
+        assert equation.primitive.name != "dot_general"
+        if equation.primitive.name == "conv_general_dilated":
+            yield equation
+        for inner in jaxprs_in_params(equation.params):
+            yield from convolutions(inner)
+
+
+def test_multiply_adds_are_those_of_the_traced_program():
+    params, tensors = random_run(steps=1, batch=1, height=23, width=31)
+    program = jax.make_jaxpr(step)(params, initial_state(1, 23, 31), tensors[0])
+    traced = 0
+    for convolution in convolutions(program.jaxpr):
+        kernel, image = convolution.invars[1].aval.shape, convolution.outvars[0].aval.shape
+        assert image[:3] == (1, 23, 31)
+        traced += 23 * 31 * int(np.prod(kernel))
+    assert multiply_adds(23, 31) == traced == 23 * 31 * 37_600
 
 
 def test_initial_gates_are_orthogonal_with_zero_bias():

@@ -1,0 +1,165 @@
+"""Are the built-in weights better than others, on pictures and recordings they never saw?
+
+    python experiments/shipped_weights.py PUBLISHED [RECORDING...] [--weights OURS]      10 minutes
+
+Simulated: textures from the five pictures that are frozen by name and in no training pool
+(`scenes.HELD_OUT`), slow and fast, with the faults of real sensors and without; means over the
+last 20 of 40 windows of 16 sequences of 240x180. Local equalisation is that of `equalise`.
+Recordings: three windows of each after warming up, the same windows for both networks; event
+pictures, theirs, ours. Writes results/shipped_weights.json, docs/shipped_simulated.jpg and
+docs/shipped_recordings.jpg.
+"""
+
+import argparse
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from harness import save
+from PIL import Image
+
+import firenet_jax as fj
+from firenet_jax import metrics
+from firenet_jax.equalise import equalise
+from firenet_jax.info import describe
+from firenet_jax.network import initial_state
+from firenet_jax.pictures import Display, display, event_pictures, initial_display_state
+from firenet_jax.reconstruction import reconstruct
+from firenet_jax.scenes import HELD_OUT, SceneSettings, load_textures, photographs
+from firenet_jax.sensor import FAULTY, SensorSettings, sequences
+
+DOCS = Path(__file__).parents[1] / "docs"
+HEIGHT, WIDTH, WINDOWS, JUDGED, BATCH, BATCHES = 180, 240, 40, 20, 2, 8
+SPEEDS = {"slow": (5.0, 50.0), "fast": (200.0, 1000.0)}
+SENSORS = {"clean": SensorSettings(), "faulty": replace(FAULTY, threshold_range=(0.1, 0.6))}
+SHOWN = 24  # windows into which a recording is cut, at least
+
+
+def scores(images: np.ndarray, data) -> dict[str, float]:
+    """Means over the judged windows: (T, B, H, W), clipped where the metrics ask for it."""
+    judged = slice(WINDOWS - JUDGED, None)
+    before = slice(WINDOWS - JUDGED - 1, -1)
+    truths = np.asarray(data.images[judged])
+    shown = np.clip(images[judged], 0, 1)
+    equalised, equalised_truths = equalise(shown, "local"), equalise(truths, "local")
+    return {
+        "ssim": float(jnp.mean(metrics.ssim(shown, truths))),
+        "mse": float(jnp.mean(metrics.mse(shown, truths))),
+        "ssim_equalised": float(jnp.mean(metrics.ssim(equalised, equalised_truths))),
+        "mse_equalised": float(jnp.mean(metrics.mse(equalised, equalised_truths))),
+        "temporal": float(
+            jnp.mean(
+                metrics.temporal_error(
+                    images[judged],
+                    images[before],
+                    data.displacement[judged],
+                    truths,
+                    data.images[before],
+                    data.visible[judged],
+                )
+            )
+        ),
+    }
+
+
+def simulated(methods: dict) -> tuple[list[dict], np.ndarray]:
+    """Rows of the table, and a sheet of pictures: truth and each method, one row a condition."""
+    textures = jnp.asarray(load_textures(photographs(HELD_OUT), 40, 320, seed=0))
+    simulate = jax.jit(
+        partial(sequences, batch=BATCH, windows=WINDOWS, height=HEIGHT, width=WIDTH),
+        static_argnames=("scene", "sensor"),
+    )
+    rows, sheet = [], []
+    for sensor in SENSORS:
+        for speed in SPEEDS:
+            scene = SceneSettings(speed=SPEEDS[speed])
+            found = {name: [] for name in methods}
+            for n in range(BATCHES):
+                data = simulate(jax.random.key(n), textures, scene=scene, sensor=SENSORS[sensor])
+                pictures = [np.asarray(data.images[-1])]
+                for name, weights in methods.items():
+                    state = initial_state(BATCH, HEIGHT, WIDTH)
+                    images = np.asarray(reconstruct(weights, state, data.tensors)[1])
+                    found[name].append(scores(images, data))
+                    pictures.append(images[-1])
+                if n == 0:
+                    sheet.append(np.concatenate([np.concatenate(list(p), 1) for p in pictures], 1))
+            for name, each in found.items():
+                means = {key: float(np.mean([row[key] for row in each])) for key in each[0]}
+                rows.append({"sensor": sensor, "speed": speed, "weights": name, **means})
+                print(*(f"{value:.4f}" if isinstance(value, float) else f"{value:12}"
+                        for value in rows[-1].values()))  # fmt: skip
+    return rows, np.concatenate(sheet)
+
+
+def recording_sheet(path: Path, methods: dict) -> Image.Image:
+    """Three windows of a recording: a row of event pictures, and one for each method."""
+    about = describe(path)
+    recording = fj.open_recording(path)
+    count = min(about["events"] // SHOWN, round(0.35 * recording.height * recording.width))
+    states = {
+        name: (initial_state(1, recording.height, recording.width), initial_display_state(1))
+        for name in methods
+    }
+    total = about["events"] // count
+    wanted = {total // 2, total * 3 // 4, total - 1}
+    rows = {name: [] for name in ("events", *methods)}
+    seen = 0
+    for tensors, _ in fj.event_tensors(recording, chunk=1, events=count):
+        for name, weights in methods.items():
+            state, shown = states[name]
+            state, images = reconstruct(weights, state, tensors)
+            shown, pictures = display(shown, images, settings=Display(auto_range=True))
+            states[name] = state, shown
+            if seen in wanted:
+                rows[name].append(np.repeat(np.asarray(pictures)[0, 0, ..., None], 3, -1))
+        if seen in wanted:
+            rows["events"].append(np.asarray(event_pictures(tensors))[0, 0])
+        seen += 1
+        if seen > max(wanted):
+            break
+    sheet = np.concatenate([np.concatenate(row, 1) for row in rows.values()])
+    picture = Image.fromarray(sheet)
+    return picture.resize((540, round(540 * picture.height / picture.width)), Image.LANCZOS)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("published", type=Path)
+    parser.add_argument("recordings", type=Path, nargs="*")
+    parser.add_argument("--weights", type=Path, help="instead of the built-in ones")
+    parser.add_argument("--skip-simulated", action="store_true")
+    options = parser.parse_args()
+    methods = {
+        "published": fj.load_weights(options.published),
+        "ours": fj.load_weights(options.weights) if options.weights else fj.load_weights(),
+    }
+    DOCS.mkdir(exist_ok=True)
+    if options.recordings:
+        sheets = []
+        for path in options.recordings:
+            print(path.name)
+            sheets.append(recording_sheet(path, methods))
+        columns = 3
+        rows = [sheets[k : k + columns] for k in range(0, len(sheets), columns)]
+        heights = [max(sheet.height for sheet in row) for row in rows]
+        whole = Image.new("RGB", (columns * 548, sum(heights) + 8 * len(rows)), "white")
+        for top, row in enumerate(rows):
+            for left, sheet in enumerate(row):
+                whole.paste(sheet, (548 * left, sum(heights[:top]) + 8 * top))
+        whole.save(DOCS / "shipped_recordings.jpg", quality=80)
+    if not options.skip_simulated:
+        rows, sheet = simulated(methods)
+        picture = Image.fromarray(np.uint8(np.round(255 * np.clip(sheet, 0, 1))))
+        picture.resize((picture.width // 2, picture.height // 2)).save(
+            DOCS / "shipped_simulated.jpg", quality=80
+        )
+        pictures = [path.name for path in photographs(HELD_OUT)]
+        save("shipped_weights", {"pictures": pictures, "rows": rows})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,779 @@
+"""Methods x sequences -> table, JSON, CSV and a report: how close images come to camera frames.
+
+The protocol is EVREAL's for the paper's data: window i holds the events between frames i-1 and i;
+reconstruction begins 10 s before the part that counts; a prediction, which has the time of its
+window's last event, counts if that is within 1 ms of a frame (a window without events has the time
+of its end). Frames and predictions are compared as (H, W) float32, clipped to 0 to 1, after
+histogram equalisation where it is asked for. Options vary each of these.
+
+    OUTPUT/results/SEQUENCE/METHOD.json     what is written when one method has seen one sequence
+    OUTPUT/results/SEQUENCE/METHOD.npz      some of its pictures
+    OUTPUT/table.csv, results.json, index.html, videos/SEQUENCE.mp4       from all of those
+
+A file of results appears when it is whole, and a run that was interrupted goes on with the others.
+What cannot be measured is a named gap: null and a reason, never a NaN.
+"""
+
+import dataclasses
+import importlib
+import importlib.metadata
+import json
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import h5py
+import jax
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from firenet_jax import lpips, metrics, report
+from firenet_jax.equalise import Kind, equalise
+from firenet_jax.events import Frames, Recording, RecordingError, logger, parse_size
+from firenet_jax.filters import between
+from firenet_jax.methods import Method, Missing, digest, load
+from firenet_jax.overlap import ahead
+from firenet_jax.readers import FORMATS, open_recording, reading
+from firenet_jax.report import METRICS
+from firenet_jax.video import OutputError, partial_name, write_video
+from firenet_jax.windows import Window, Windows, cut
+
+# Seconds from the beginning of the Event Camera Dataset's sequences (EVREAL's; one of E2VID's
+# authors gave the same in rpg_e2vid's issue 17).
+CUTS = {
+    "boxes_6dof": (5.0, 20.0),
+    "calibration": (5.0, 20.0),
+    "dynamic_6dof": (5.0, 20.0),
+    "office_zigzag": (5.0, 12.0),
+    "poster_6dof": (5.0, 20.0),
+    "shapes_6dof": (5.0, 20.0),
+    "slider_depth": (1.0, 2.5),
+}
+SUFFIXES = (".h5", ".hdf5", ".hdf", ".zip", ".bag", ".mcap", ".aedat4")  # which can hold frames
+SMALLEST = 17  # pixels of a side: what CW-SSIM's filters need
+BATCH = 8  # images that are compared at once
+STILLS = (0.2, 0.55, 0.9)  # places of the pictures that are kept, in the part that counts
+CLIP = 60  # pictures of a video
+WIDEST = 2000  # pixels of a video
+
+
+COMPARED = [name for name in METRICS if name not in ("lpips", "temporal_error")]
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare methods with the frames of recordings: a table, JSON, CSV and a report to look at.
+
+    Examples:
+      firenet evaluate dynamic_6dof.zip boxes_6dof.zip -o report/ --weights firenet.npz
+      firenet evaluate simulated/ -o report/ --methods firenet,hf,mr
+      firenet evaluate hqf/*.h5 -o report/ --weights ours.npz firenet_plus.pth --equalise local
+    """
+
+    data: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="DATA...", help_behavior_hint=""),
+    ]
+    """Recordings with frames: ECD folders, zips and bags, HDF5 (HQF, MVSEC, our own), EVREAL
+    folders; or folders of such recordings."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """A folder, for index.html, table.csv and results.json. An evaluation that was interrupted
+    goes on there, and one with more data or methods uses what is there."""
+    methods: str = "firenet,e2vid,hf,mr"
+    """Of firenet, e2vid, hf (high-pass filter) and mr (manifold regularisation), with commas."""
+    weights: Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-c"])] = ()
+    """Weights of FireNet or FireNet+: each file is a method named after it."""
+    e2vid_weights: Path | None = None
+    """E2VID's published checkpoint, or E2VID+'s."""
+    e2vid_sigmoid: bool = True
+    """--no-e2vid-sigmoid for E2VID+, whose images pass no sigmoid."""
+    e2vid_random: bool = False
+    """Run E2VID with random weights, to measure its time."""
+    events: Annotated[int | None, tyro.conf.arg(aliases=["-N"])] = None
+    """Windows of this many events instead of those between frames."""
+    duration: Annotated[float | None, tyro.conf.arg(aliases=["-T"])] = None
+    """Windows of this many milliseconds instead of those between frames."""
+    keep_ratio: float = 1.0
+    """Use only this share of the frames, drawn at random: windows between them get longer and
+    uneven."""
+    seed: int = 0
+    """Another number draws other frames."""
+    start: float | None = None
+    """Count frames from this many seconds after the beginning (the first event or frame). For
+    recordings named as the Event Camera Dataset's the paper's interval is the default."""
+    stop: float | None = None
+    """Count frames up to this many seconds after the beginning."""
+    warm_up: float = 10.0
+    """Begin to reconstruct this many seconds before the first frame that counts."""
+    tolerance: float = 1.0
+    """A prediction counts if it is at most so many milliseconds from a frame."""
+    equalise: Kind = "none"
+    """Histogram equalisation of images and frames before they are compared."""
+    lpips: tuple[Path, Path] | None = None
+    """LPIPS, by two files: torchvision's AlexNet or SqueezeNet, and its linear layers."""
+    sensor_size: str | None = None
+    """WIDTHxHEIGHT of the sensor, such as 240x180, where the recordings do not say it."""
+    overwrite: bool = False
+    """Compute again what an evaluation with other settings left in the output folder."""
+
+    def __post_init__(self):
+        if not self.data:
+            raise ValueError("no data: name one or more recordings, or folders of them")
+        Windows(events=self.events, duration=self.duration)  # refuses numbers that cannot be
+        if not 0 < self.keep_ratio <= 1:
+            raise ValueError(f"keep ratio is {self.keep_ratio}, but is a share, 0 to 1")
+        if self.keep_ratio < 1 and not self.between_frames:
+            raise ValueError("keep ratio thins out frames: it varies windows between frames only")
+        for name in ("warm_up", "tolerance"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise ValueError(f"{name} is {value}, but must be 0 or more")
+        if self.stop is not None and self.stop <= (self.start or 0):
+            raise ValueError(f"stop is {self.stop} s, but must come after the start")
+        parse_size(self.sensor_size)
+
+    @property
+    def between_frames(self) -> bool:
+        return self.events is None and self.duration is None
+
+    @property
+    def windows(self) -> Windows:
+        return Windows(self.events, None, self.duration, self.between_frames)
+
+
+class Gap(Exception):
+    """Why a number is not there, in a few words for a table."""
+
+
+class Plan(NamedTuple):
+    """What of a recording is reconstructed, and what of it counts."""
+
+    name: str
+    recording: Recording
+    numbers: np.ndarray  # (F,) of the frames that are used, in the recording
+    times: np.ndarray  # (F,) int64, microseconds
+    first: int  # of these, the frames first <= i < last count
+    last: int
+    origin: int  # microseconds: the sequence's beginning
+    span: tuple[float, float | None]  # seconds after the first event: what is reconstructed
+
+
+class Comparison(NamedTuple):
+    """What one image is compared with."""
+
+    place: int  # of the frame, in Plan.times
+    image: jax.Array  # (H, W), raw
+    truth: np.ndarray  # (H, W) uint8
+    flow: np.ndarray | None  # (H, W, 2) pixels since the frame before
+
+
+def run(settings: Evaluate) -> dict:
+    """Does what the settings say; returns what results.json holds. Raises RecordingError,
+    CheckpointError, OutputError or ValueError with a message of one sentence."""
+    sequences = find_sequences(settings.data)
+    methods = load(
+        [name.strip() for name in settings.methods.split(",") if name.strip()],
+        settings.weights,
+        settings.e2vid_weights,
+        e2vid_random=settings.e2vid_random,
+        e2vid_sigmoid=settings.e2vid_sigmoid,
+    )
+    learned = None if settings.lpips is None else lpips.load(*settings.lpips)
+    size = parse_size(settings.sensor_size)
+    recordings = {name: open_recording(path, size) for name, path in sequences.items()}
+    shared = describe(settings, learned)
+    records = {
+        (name, method.name): describe_one(shared, recording, method)
+        for name, recording in recordings.items()
+        for method in methods
+        if isinstance(method, Method)
+    }
+    done = open_folder(settings, records)
+
+    plans: dict[str, Plan] = {}
+    gaps = {
+        (name, method.name): method.reason
+        for name in recordings
+        for method in methods
+        if isinstance(method, Missing)
+    }
+    for name, recording in recordings.items():
+        try:
+            plans[name] = plan(name, recording, settings)
+        except (Gap, RecordingError) as error:
+            logger.warning("%s: %s", recording.path, error)
+            gaps = {(name, method.name): str(error) for method in methods} | gaps
+    work = [key for key in records if key not in done and key not in gaps]
+    by_name = {method.name: method for method in methods}
+    total = sum(plans[name].last for name, _ in work)
+    with tqdm(total=total, unit="frames", smoothing=0.1, disable=None) as progress:
+        for name, method in work:
+            progress.set_postfix_str(f"{name}, {method}")
+            try:
+                found, pictures = evaluate(
+                    plans[name], by_name[method], settings, learned, progress
+                )
+            except (Gap, RecordingError) as error:
+                logger.warning("%s, %s: %s", name, method, error)
+                gaps[name, method] = str(error)
+                continue
+            save(result_file(settings, name, method), records[name, method], found, pictures)
+            done[name, method] = found
+    if not any(key in done for key in records):
+        reason = next(iter(gaps.items()), (("", ""), "no method can run"))
+        raise RecordingError(f"nothing can be evaluated: {' / '.join(reason[0])}: {reason[1]}")
+
+    results = summarise(settings, shared, plans, recordings, methods, done, gaps)
+    write_all(settings, results, plans, by_name)
+    return results
+
+
+# ---- Data
+
+
+def find_sequences(paths: tuple[Path, ...]) -> dict[str, Path]:
+    """Recordings and folders of them -> name: path. Raises RecordingError for an empty folder and
+    for two of one name."""
+    found: dict[str, Path] = {}
+    for path in paths:
+        inside = [path]
+        if path.is_dir() and not is_recording(path):
+            inside = recordings_in(path)
+            if not inside:
+                raise RecordingError(f"{path}: holds no recordings: name files or other folders")
+        for recording in inside:
+            parts = [path.resolve().name, *recording.relative_to(path).parts]
+            if recording.is_file():
+                parts[-1] = Path(parts[-1]).stem
+            name = "-".join(parts)
+            if name in found:
+                raise RecordingError(
+                    f"{found[name]} and {recording} are both named {name}: rename one of them"
+                )
+            found[name] = recording
+    return found
+
+
+def is_recording(path: Path) -> bool:
+    modules = (importlib.import_module(f"firenet_jax.readers.{name}") for name in FORMATS)
+    return any(module.matches(path) for module in modules)
+
+
+def recordings_in(folder: Path) -> list[Path]:
+    found = []
+    for path in sorted(folder.iterdir()):
+        if path.is_dir():
+            found += [path] if is_recording(path) else recordings_in(path)
+        elif path.suffix.lower() in SUFFIXES and ".partial" not in path.name:
+            found.append(path)
+    return found
+
+
+def plan(name: str, recording: Recording, settings: Evaluate) -> Plan:
+    """Which frames count and where reconstruction begins. Raises Gap where nothing can count."""
+    frames = recording.frames
+    if frames is None or len(frames.times) < 2:
+        raise Gap("no frames")
+    height, width = frames.read(0).shape
+    if (height, width) != (recording.height, recording.width):
+        raise Gap(
+            f"frames are {width}x{height}, the sensor is {recording.width}x{recording.height}"
+        )
+    if min(height, width) < SMALLEST:
+        raise Gap(f"{width}x{height} pixels are too small to be compared")
+    times = np.asarray(frames.times, np.int64)
+    if (np.diff(times) < 0).any():
+        raise Gap("times of frames run backwards")
+    event = begin = first_event(recording, times)
+    origin = min(event, int(times[0]))
+    numbers = np.arange(len(times))
+    if settings.keep_ratio < 1:
+        count = max(2, int(settings.keep_ratio * len(times)))
+        draw = np.random.default_rng(settings.seed)
+        numbers = np.sort(draw.choice(len(times), count, replace=False))
+        times = times[numbers]
+    start, stop = interval(recording.path, settings)
+    seconds = (times - origin) / 1e6
+    counting = np.flatnonzero((seconds >= start) & (seconds <= stop))
+    counting = counting[counting > 0]  # no window ends at the first frame
+    if not counting.size:
+        raise Gap(f"no frames from {start:g} to {stop:g} s")
+    first, last = int(counting[0]), int(counting[-1]) + 1
+    # Reconstruction begins at a frame, so that windows between frames are whole.
+    warm = np.searchsorted(times, origin + round(1e6 * (start - settings.warm_up)), "right") - 1
+    if warm >= 0:
+        begin = max(begin, int(times[min(warm, first - 1)]))
+    # Windows of other kinds that the last frame would cut are left whole.
+    end = (int(times[last - 1]) - event) / 1e6 if settings.between_frames else None
+    span = ((begin - event) / 1e6, end)
+    return Plan(name, recording, numbers, times, first, last, origin, span)
+
+
+def interval(path: Path, settings: Evaluate) -> tuple[float, float]:
+    """Seconds from the sequence's beginning: what counts."""
+    if settings.start is None and settings.stop is None:
+        name = path.resolve().name if path.is_dir() else path.stem
+        return CUTS.get(name, (0.0, math.inf))
+    return settings.start or 0.0, math.inf if settings.stop is None else settings.stop
+
+
+def first_event(recording: Recording, times: np.ndarray) -> int:
+    """Its time. Raises Gap where the events do not reach from before the last frame to after the
+    first."""
+    first = last = None
+    for events in recording.events():
+        first = int(events.t[0]) if first is None else first
+        last = int(events.t[-1])
+        if last >= times[0]:
+            break
+    if first is None:
+        raise Gap("no events")
+    if first > times[-1] or last < times[0]:
+        raise Gap(
+            f"no overlap in time: frames {times[0] / 1e6:.6f} to {times[-1] / 1e6:.6f} s, events "
+            + (f"from {first / 1e6:.6f} s" if first > times[-1] else f"up to {last / 1e6:.6f} s")
+        )
+    return first
+
+
+def windows_of(plan: Plan, settings: Evaluate) -> Iterator[Window]:
+    recording = plan.recording
+    frames = Frames(plan.times, recording.frames.read)
+    chunks = between(recording.events(), *plan.span)
+    return cut(dataclasses.replace(recording, frames=frames), settings.windows, chunks)
+
+
+def read_flow(plan: Plan, place: int) -> np.ndarray | None:
+    """(H, W, 2) pixels since the frame before, where the file has them (event_cnn_minimal's HDF5)
+    and the frame before is used too."""
+    path, number = plan.recording.path, int(plan.numbers[place])
+    if place == 0 or number != plan.numbers[place - 1] + 1 or not h5py.is_hdf5(path):
+        return None
+    with reading(path, OSError, RuntimeError, KeyError), h5py.File(path, "r") as file:
+        names = sorted(file.get("images", ()))
+        name = names[number].replace("image", "flow") if names else ""
+        if name not in file.get("flow", ()):
+            return None
+        velocity = file["flow"][name][()]
+    size = (2, plan.recording.height, plan.recording.width)
+    if velocity.shape != size:
+        raise RecordingError(f"{path}, {name}: has the shape {velocity.shape}, expected {size}")
+    seconds = np.float32(1e-6 * (plan.times[place] - plan.times[place - 1]))
+    return seconds * np.moveaxis(velocity.astype(np.float32), 0, -1)
+
+
+# ---- One method and one sequence
+
+
+def evaluate(
+    plan: Plan, method: Method, settings: Evaluate, learned: lpips.Lpips | None, progress: tqdm
+) -> tuple[dict, dict[str, np.ndarray]]:
+    """-> (numbers for each frame, ready for JSON; pictures (n, H, W) uint8 and their frames).
+
+    Raises Gap where no prediction counts or an image is not finite.
+    """
+    began, before = time.monotonic(), progress.n
+    windows = ahead(iter(windows_of(plan, settings)), depth=4)
+    tolerance = round(1000 * settings.tolerance)
+    latest = int(plan.times[plan.last - 1]) + tolerance
+    empty = 0
+
+    def predictions():
+        nonlocal empty
+        state = method.initial(plan.recording.height, plan.recording.width)
+        for window in windows:
+            if window.time > latest:
+                return
+            state, image = method.step(state, window)
+            empty += len(window.events) == 0
+            passed = np.searchsorted(plan.times, window.time, "right")
+            progress.update(int(min(passed, plan.last)) - (progress.n - before))
+            yield window.time, image
+
+    found, pictures = Numbers(plan, settings, learned), Pictures(plan)
+    waiting: list[Comparison] = []
+    try:
+        for place, image in matched(predictions(), plan.times, tolerance):
+            if plan.first <= place < plan.last:
+                truth = plan.recording.frames.read(int(plan.numbers[place]))
+                if truth.shape != image.shape:
+                    raise Gap(f"frame {plan.numbers[place] + 1} is of another size: {truth.shape}")
+                waiting.append(Comparison(place, image, truth, read_flow(plan, place)))
+            if len(waiting) == BATCH:
+                pictures.add(waiting, found.add(waiting))
+                waiting = []
+        if waiting:
+            pictures.add(waiting, found.add(waiting))
+    finally:
+        windows.close()
+        progress.update(plan.last - (progress.n - before))
+    if not found.places:
+        raise Gap(f"no prediction within {settings.tolerance:g} ms of a frame")
+    return found.result(empty, time.monotonic() - began), pictures.arrays()
+
+
+def matched(
+    predictions: Iterator[tuple[int, jax.Array]], times: np.ndarray, tolerance: int
+) -> Iterator[tuple[int, jax.Array]]:
+    """(time, image) in time order -> (place of a frame, image): of each frame the closest
+    prediction, if that is at most `tolerance` microseconds away."""
+    best: tuple[int, int, jax.Array] | None = None
+    for moment, image in predictions:
+        after = int(np.searchsorted(times, moment))
+        near = [place for place in (after - 1, after) if 0 <= place < len(times)]
+        place = min(near, key=lambda place: abs(int(times[place]) - moment))
+        distance = abs(int(times[place]) - moment)
+        if distance > tolerance:
+            continue
+        if best is not None and best[0] != place:
+            yield best[0], best[2]
+            best = None
+        if best is None or distance < best[1]:
+            best = place, distance, image
+    if best is not None:
+        yield best[0], best[2]
+
+
+class Numbers:
+    """The numbers of one method's images of one sequence, batch by batch."""
+
+    def __init__(self, plan: Plan, settings: Evaluate, learned: lpips.Lpips | None):
+        self.plan, self.kind, self.learned = plan, settings.equalise, learned
+        self.places: list[int] = []
+        self.values = {name: [] for name in METRICS if name != "lpips" or learned}
+        self.last: tuple[int, np.ndarray, np.ndarray] | None = None  # place, image, truth
+
+    def add(self, batch: list[Comparison]) -> tuple[np.ndarray, np.ndarray]:
+        """Measures; returns images and truths as they were compared, (n, H, W) float32."""
+        places = [entry.place for entry in batch]
+        images = np.stack(jax.device_get([entry.image for entry in batch]))
+        if not np.isfinite(images).all():
+            bad = places[int(np.argmin(np.isfinite(images).all((1, 2))))]
+            raise Gap(f"image of frame {self.plan.numbers[bad] + 1} is not finite")
+        images = np.clip(images, 0, 1)
+        truths = np.stack([entry.truth for entry in batch]).astype(np.float32) / 255
+        compared = equalise(images, self.kind), equalise(truths, self.kind)
+        count = len(batch)
+        for name, values in _compare(*map(_whole, compared)).items():
+            self.values[name] += values[:count].tolist()
+        if self.learned:
+            distances = lpips.lpips(self.learned, *map(_whole, compared))
+            self.values["lpips"] += distances[:count].tolist()
+        self.values["temporal_error"] += self._temporal(batch, images, truths)
+        self.places += places
+        return compared
+
+    def _temporal(self, batch, images, truths) -> list[float | None]:
+        """Of images that are not equalised: it is flicker that counts, not contrast."""
+        last = self.last or (-1, images[0], truths[0])
+        befores = [last[0], *(entry.place for entry in batch[:-1])]
+        self.last = batch[-1].place, images[-1], truths[-1]
+        known = [
+            entry.flow is not None and entry.place == before + 1
+            for entry, before in zip(batch, befores, strict=True)
+        ]
+        if not any(known):
+            return [None] * len(batch)
+        still = np.zeros((*images.shape[1:], 2), np.float32)
+        flows = np.stack([e.flow if k else still for e, k in zip(batch, known, strict=True)])
+        previous = np.concatenate([last[1][None], images[:-1]])
+        previous_truths = np.concatenate([last[2][None], truths[:-1]])
+        errors = metrics.temporal_error(
+            *map(_whole, (images, previous, flows, truths, previous_truths))
+        ).tolist()
+        return [error if k else None for error, k in zip(errors, known, strict=False)]
+
+    def result(self, empty: int, seconds: float) -> dict:
+        """Ready for JSON: a value that is not finite becomes null, its metric a gap."""
+        gaps = {}
+        values = {}
+        for name, series in self.values.items():
+            good = [value is None or math.isfinite(value) for value in series]
+            if not all(good):
+                place = self.places[good.index(False)]
+                gaps[name] = f"infinite at frame {self.plan.numbers[place] + 1}"
+            elif all(value is None for value in series):
+                gaps[name] = "no flow"
+            values[name] = [v if ok else None for v, ok in zip(series, good, strict=True)]
+        if not self.learned:
+            gaps["lpips"] = "no weights"
+        return {
+            "frames": len(self.places),
+            "of": self.plan.last - self.plan.first,
+            "windows_without_events": empty,
+            "seconds": round(seconds, 3),
+            "gaps": gaps,
+            "frame_numbers": [int(self.plan.numbers[place]) for place in self.places],
+            "times": [
+                round((int(t) - self.plan.origin) / 1e6, 6) for t in self.plan.times[self.places]
+            ],
+            "values": values,
+        }
+
+
+def _whole(batch: np.ndarray) -> np.ndarray:
+    """(n, ...) -> (BATCH, ...), the last entry repeated: one size compiles once."""
+    return np.concatenate([batch, np.repeat(batch[-1:], BATCH - len(batch), 0)])
+
+
+@jax.jit
+def _compare(images: jax.Array, truths: jax.Array) -> dict[str, jax.Array]:
+    return {name: getattr(metrics, name)(images, truths) for name in COMPARED}
+
+
+class Pictures:
+    """The few pictures that the report shows, out of all: stills and a stretch for the video."""
+
+    def __init__(self, plan: Plan):
+        count = plan.last - plan.first
+        self.numbers = plan.numbers
+        self.wanted = [plan.first + int(share * count) for share in STILLS]
+        self.begin = plan.first + max(0, (count - CLIP) // 2)
+        self.kept: dict[str, list] = {"stills": [], "clip": []}
+
+    def add(self, batch: list[Comparison], compared: tuple[np.ndarray, np.ndarray]) -> None:
+        for entry, image in zip(batch, compared[0], strict=True):
+            picture = int(self.numbers[entry.place]), to_8_bit(image)
+            if self.wanted and entry.place >= self.wanted[0]:
+                self.wanted = [place for place in self.wanted if place > entry.place]
+                self.kept["stills"].append(picture)
+            if entry.place >= self.begin and len(self.kept["clip"]) < CLIP:
+                self.kept["clip"].append(picture)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        arrays = {}
+        for name, kept in self.kept.items():
+            arrays[f"{name}_frames"] = np.array([number for number, _ in kept], np.int64)
+            arrays[name] = np.array([picture for _, picture in kept], np.uint8)
+        return arrays
+
+
+def to_8_bit(image: np.ndarray) -> np.ndarray:
+    return np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
+
+
+# ---- Results on disk
+
+
+def describe(settings: Evaluate, learned: lpips.Lpips | None) -> dict:
+    """All that numbers depend on but recording and method, ready for JSON."""
+    names = ("events", "duration", "keep_ratio", "seed", "start", "stop", "warm_up", "tolerance",
+             "equalise", "sensor_size")  # fmt: skip
+    record = {name: getattr(settings, name) for name in names}
+    record["lpips"] = None if learned is None else digest(learned)
+    return record | {"version": importlib.metadata.version("firenet-jax")}
+
+
+def describe_one(shared: dict, recording: Recording, method: Method) -> dict:
+    status = recording.path.stat()
+    identity = [recording.path.name, status.st_size, status.st_mtime_ns]
+    return shared | {"recording": identity, **method.record}
+
+
+def result_file(settings: Evaluate, sequence: str, method: str) -> Path:
+    return settings.output / "results" / sequence / f"{method}.json"
+
+
+def open_folder(settings: Evaluate, records: dict[tuple[str, str], dict]) -> dict:
+    """Makes the output folder; returns the results of an earlier run that belong to this one.
+
+    Raises OutputError where a result was made by other settings, which `overwrite` replaces.
+    """
+    folder = settings.output
+    if folder.is_file():
+        raise OutputError(f"{folder} is a file: choose another name for the folder")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "results").is_dir():
+        raise OutputError(f"{folder} is a folder of something else: choose another output")
+    done = {}
+    for key, record in records.items():
+        path = result_file(settings, *key)
+        if not (path.is_file() and path.with_suffix(".npz").is_file()):
+            continue
+        try:
+            saved = json.loads(path.read_text())
+            other = sorted(
+                name
+                for name in {*record, *saved["record"]}
+                if saved["record"].get(name) != record.get(name)
+            )
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise OutputError(f"{path} is damaged ({error}): remove it") from error
+        if not other:
+            done[key] = saved["result"]
+        elif not settings.overwrite:
+            pairs = ", ".join(
+                f"{name} was {saved['record'].get(name)}, now {record.get(name)}" for name in other
+            )
+            raise OutputError(
+                f"{path} was made with other settings ({pairs}): choose another output, or pass "
+                "--overwrite to compute it again"
+            )
+    for key in records:
+        try:
+            result_file(settings, *key).parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot make it ({error.strerror})") from error
+    if done:
+        logger.warning("%s: going on, %d of %d results are there", folder, len(done), len(records))
+    return done
+
+
+def save(path: Path, record: dict, result: dict, pictures: dict[str, np.ndarray]) -> None:
+    """The pictures first: numbers that are there mean that all is."""
+    beside = partial_name(path.with_suffix(".npz"))
+    np.savez_compressed(beside, **pictures)
+    beside.replace(path.with_suffix(".npz"))
+    write_text(path, json.dumps({"record": record, "result": result}, allow_nan=False))
+
+
+def write_text(path: Path, text: str) -> None:
+    beside = partial_name(path)
+    beside.write_text(text, encoding="utf-8")
+    beside.replace(path)
+
+
+# ---- Tables
+
+
+def summarise(settings, shared, plans, recordings, methods, done, gaps) -> dict:
+    """What results.json holds: settings, numbers of each sequence and method, means."""
+    sequences = {}
+    for name, recording in recordings.items():
+        entries = {}
+        for method in methods:
+            key = name, method.name
+            found = done.get(key)
+            entries[method.name] = {"gap": gaps[key]} if found is None else summary(found)
+        start, stop = interval(recording.path, settings)
+        sequences[name] = {
+            "path": str(recording.path),
+            "format": recording.format,
+            "sensor": [recording.width, recording.height],
+            "counted_seconds": [start, None if math.isinf(stop) else stop],
+            "methods": entries,
+        }
+    names = [method.name for method in methods]
+    return {
+        "settings": shared,
+        "protocol": protocol(settings),
+        "metrics": {name: metric._asdict() for name, metric in METRICS.items()},
+        "methods": {m.name: getattr(m, "record", None) for m in methods},
+        "sequences": sequences,
+        "means": {
+            "over sequences": {name: mean(sequences, name, weigh=False) for name in names},
+            "over frames": {name: mean(sequences, name, weigh=True) for name in names},
+        },
+    }
+
+
+def summary(found: dict) -> dict:
+    """The numbers of one method and sequence with their means; null where there is a gap."""
+    means = {}
+    for name in METRICS:
+        values = [value for value in found["values"].get(name, []) if value is not None]
+        means[name] = None if name in found["gaps"] else sum(values) / len(values)
+    return {"means": means, **found}
+
+
+def mean(sequences: dict, method: str, weigh: bool) -> dict:
+    """Means of a method over sequences, or, weighed, over all of their frames."""
+    entries = [entry["methods"][method] for entry in sequences.values()]
+    there = [entry for entry in entries if "gap" not in entry]
+    if not there:
+        return {"gap": entries[0]["gap"]}
+    means, gaps = {}, {}
+    for name in METRICS:
+        with_it = [entry for entry in there if entry["means"][name] is not None]
+        weights = [
+            sum(v is not None for v in entry["values"][name]) if weigh else 1 for entry in with_it
+        ]
+        values = [entry["means"][name] for entry in with_it]
+        means[name] = float(np.average(values, weights=weights)) if values else None
+        if not values:
+            gaps[name] = there[0]["gaps"][name]
+    return {
+        "means": means,
+        "gaps": gaps,
+        "sequences": len(there),
+        "of_sequences": len(entries),
+        "frames": sum(entry["frames"] for entry in there),
+    }
+
+
+def protocol(settings: Evaluate) -> list[str]:
+    """What was done, in sentences, for people who read a table."""
+    if settings.between_frames:
+        windows = "windows between frames"
+    elif settings.events is not None:
+        windows = f"windows of {settings.events} events"
+    else:
+        windows = f"windows of {settings.duration:g} ms"
+    if settings.keep_ratio < 1:
+        windows += f", {settings.keep_ratio:g} of the frames kept (seed {settings.seed})"
+    return [
+        f"{windows}; warm-up of up to {settings.warm_up:g} s; predictions within "
+        f"{settings.tolerance:g} ms of a frame count",
+        f"histogram equalisation before metrics: {settings.equalise} (temporal error: none); "
+        "images clipped to 0 to 1",
+        "SSIM: Gaussian window of 11x11 pixels, sigma 1.5, population covariance, data range 1, "
+        "without the border; PSNR in dB for a range of 1",
+        "temporal error: mean M |I_k - W(I_k-1)|, warped by the data's optical flow; Features: "
+        "distance between features of a random network",
+    ]
+
+
+def write_all(settings: Evaluate, results: dict, plans: dict[str, Plan], methods: dict) -> None:
+    """Prints the table; writes results.json, table.csv, the videos and index.html."""
+    folder = settings.output
+    write_text(folder / "results.json", json.dumps(results, indent=1, allow_nan=False))
+    write_text(folder / "table.csv", report.spreadsheet(results))
+    shown = {name: show(settings, plan, methods) for name, plan in plans.items()}
+    write_text(folder / "index.html", report.page(results, shown))
+    print(report.table(results))
+    print(f"\n{folder / 'index.html'}: the report; table.csv and results.json beside it")
+
+
+def show(settings: Evaluate, plan: Plan, methods: dict) -> report.Shown:
+    """The pictures of a sequence side by side, the frames first, and its video on disk."""
+    kept = {}
+    for name in methods:
+        path = result_file(settings, plan.name, name).with_suffix(".npz")
+        if path.is_file():
+            with np.load(path, allow_pickle=False) as saved:
+                kept[name] = {key: saved[key] for key in saved.files}
+    truths: dict[int, np.ndarray] = {}
+
+    def truth(number: int) -> np.ndarray:
+        if number not in truths:
+            frame = plan.recording.frames.read(number).astype(np.float32) / 255
+            truths[number] = to_8_bit(equalise(frame, settings.equalise))
+        return truths[number]
+
+    def side_by_side(kind: str) -> Iterator[tuple[int, list[np.ndarray]]]:
+        """Frames that every method has: (number, [frame, method, method ...])."""
+        sets = [set(found[f"{kind}_frames"].tolist()) for found in kept.values()]
+        for number in sorted(set.intersection(*sets)) if sets else []:
+            places = [found[f"{kind}_frames"].tolist().index(number) for found in kept.values()]
+            images = [f[kind][p] for f, p in zip(kept.values(), places, strict=True)]
+            yield number, [truth(number), *images]
+
+    times = plan.recording.frames.times
+    stills = [
+        (f"{(int(times[number]) - plan.origin) / 1e6:.3f} s", images)
+        for number, images in side_by_side("stills")
+    ]
+    clip = list(side_by_side("clip"))
+    video = None
+    if len(clip) > 1:
+        path = settings.output / "videos" / f"{plan.name}.mp4"
+        path.parent.mkdir(exist_ok=True)
+        step = np.median(np.diff([int(times[number]) for number, _ in clip])) / 1e6
+        coarser = -(-len(clip[0][1]) * plan.recording.width // WIDEST)
+        rows = (np.concatenate(images, 1)[::coarser, ::coarser] for _, images in clip)
+        write_video(path, rows, float(np.clip(1 / max(step, 1e-3), 1, 60)))
+        video = path.read_bytes()
+    return report.Shown(["frame", *kept], stills, video)

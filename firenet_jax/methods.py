@@ -1,0 +1,167 @@
+"""Names and weights -> methods: whatever makes images of events, behind one interface.
+
+    state = method.initial(height, width)
+    state, image = method.step(state, window)        image: (H, W) float32 on the device
+
+Windows are consecutive, in time order, of any size; images are nominally 0 to 1 and not clipped.
+A method is a function below and a line in `load`. Networks compile once for a sensor size; what
+packs events compiles for each of a few sizes of windows (`tensors.CAPACITIES`).
+"""
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from firenet_jax.baselines import e2vid, high_pass, manifold
+from firenet_jax.checkpoint import load_weights
+from firenet_jax.events import logger
+from firenet_jax.network import Weights, initial_state
+from firenet_jax.pytorch_file import CheckpointError
+from firenet_jax.reconstruction import reconstruct
+from firenet_jax.tensors import normalise, pack, voxelise
+from firenet_jax.windows import Window
+
+NAMES = ("firenet", "e2vid", "hf", "mr")
+
+
+class Method(NamedTuple):
+    """One way to turn windows of events into images."""
+
+    name: str
+    initial: Callable[[int, int], Any]  # height, width -> the state before the first window
+    step: Callable[[Any, Window], tuple[Any, jax.Array]]  # (state, window) -> (state, image)
+    record: dict  # all that its images depend on, ready for JSON
+
+
+class Missing(NamedTuple):
+    """A method that was named but cannot run."""
+
+    name: str
+    reason: str
+
+
+class Sized(NamedTuple):
+    """The state of a network that pads its input: it alone does not tell the sensor's size."""
+
+    network: Any
+    height: int
+    width: int
+
+
+def load(
+    names: Sequence[str],
+    weights: Sequence[Path] = (),
+    e2vid_weights: Path | None = None,
+    *,
+    e2vid_random: bool = False,
+    e2vid_sigmoid: bool = True,
+) -> list[Method | Missing]:
+    """The methods of these names, in their order.
+
+    weights: files of FireNet or FireNet+, each a method named by its stem; without any, those of
+    the package. e2vid_random: where no file is named, random weights: for measuring time.
+    e2vid_sigmoid: False for E2VID+. A method without weights is `Missing`.
+    Raises ValueError for unknown and repeated names, CheckpointError for files that cannot be read.
+    """
+    found: list[Method | Missing] = []
+    for name in names:
+        if name not in NAMES:
+            raise ValueError(f"no method {name!r}: choose from {', '.join(NAMES)}")
+        if name == "firenet" and weights:
+            found += [firenet(path.resolve().stem, load_weights(path)) for path in weights]
+        elif name == "firenet":
+            try:
+                found.append(firenet(name, load_weights()))
+            except CheckpointError:
+                found.append(_missing(name, "--weights"))
+        elif name == "e2vid" and e2vid_weights is not None:
+            found.append(recurrent_unet(name, *e2vid.load(e2vid_weights, sigmoid=e2vid_sigmoid)))
+        elif name == "e2vid" and e2vid_random:
+            params = e2vid.initial_params(jax.random.key(0))
+            found.append(recurrent_unet("e2vid-random", params))
+        elif name == "e2vid":
+            found.append(_missing(name, "--e2vid-weights"))
+        elif name == "hf":
+            found.append(filtered(name))
+        else:
+            found.append(regularised(name))
+    found_names = [method.name for method in found]
+    twice = next((name for name in found_names if found_names.count(name) > 1), None)
+    if twice:
+        raise ValueError(
+            f"two methods are named {twice}: rename a file of weights, or name it once"
+        )
+    return found
+
+
+def _missing(name: str, option: str) -> Missing:
+    logger.warning("%s has no weights and is left out: pass %s FILE", name, option)
+    return Missing(name, "no weights")
+
+
+def firenet(name: str, weights: Weights) -> Method:
+    """FireNet and FireNet+: Eq. 1's tensor of a window through the network."""
+    weights = jax.device_put(weights)
+
+    def step(state, window):
+        tensor = _tensor(window, *state.g1.shape[1:3])
+        state, images = reconstruct(weights, state, tensor)
+        return state, images[0, 0]
+
+    record = {"method": "firenet", "normalise": weights.normalise, "weights": digest(weights)}
+    return Method(name, partial(initial_state, 1), step, record)
+
+
+def recurrent_unet(name: str, params, settings: e2vid.Settings = e2vid.Settings()) -> Method:
+    """E2VID and E2VID+."""
+    params = jax.device_put(params)
+
+    def initial(height, width):
+        return Sized(e2vid.initial_state(1, height, width, settings), height, width)
+
+    def step(state, window):
+        tensor = _tensor(window, state.height, state.width)
+        network, image = _unet_step(params, state.network, tensor, settings)
+        return state._replace(network=network), image
+
+    record = {"method": "e2vid", "weights": digest(params), **dataclasses.asdict(settings)}
+    return Method(name, initial, step, record)
+
+
+@partial(jax.jit, static_argnames="settings")
+def _unet_step(params, state, tensor, settings):
+    state, images = e2vid.step(params, state, normalise(tensor[0]), settings)
+    return state, images[0]
+
+
+def filtered(name: str, settings: high_pass.HighPass = high_pass.HighPass()) -> Method:
+    """HF, the high-pass filter, with a bilateral filter after it as in the FireNet paper."""
+    step = partial(high_pass.step, settings=settings)
+    record = {"method": "hf", **dataclasses.asdict(settings)}
+    return Method(name, high_pass.initial_state, step, record)
+
+
+def regularised(name: str, settings: manifold.Manifold = manifold.Manifold()) -> Method:
+    """MR, manifold regularisation."""
+    initial = partial(manifold.initial_state, settings=settings)
+    record = {"method": "mr", **dataclasses.asdict(settings)}
+    return Method(name, initial, partial(manifold.step, settings=settings), record)
+
+
+def digest(tree) -> str:
+    """Arrays under names -> a short text that differs where any of them does."""
+    found = hashlib.sha256()
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        found.update(jax.tree_util.keystr(path).encode() + np.asarray(leaf).tobytes())
+    return found.hexdigest()[:16]
+
+
+def _tensor(window: Window, height: int, width: int) -> jax.Array:
+    """A window -> (1, 1, H, W, 5), not normalised."""
+    return voxelise(pack([[window.events]]), height=height, width=width)

@@ -1,0 +1,393 @@
+"""Methods beside frames: numbers against a direct computation, gaps, resuming, the report."""
+
+import csv
+import json
+from html.parser import HTMLParser
+
+import jax
+import numpy as np
+import pytest
+from skimage.metrics import structural_similarity
+
+from firenet_jax import cli, evaluate, methods, metrics
+from firenet_jax.checkpoint import save_weights
+from firenet_jax.dataset import Picture, write_sequence
+from firenet_jax.evaluate import Evaluate, interval, matched, plan, run
+from firenet_jax.events import Events
+from firenet_jax.methods import Missing, load
+from firenet_jax.network import Weights, initial_params
+from firenet_jax.pytorch_file import CheckpointError
+from firenet_jax.readers import open_recording
+from firenet_jax.report import METRICS, steps
+from firenet_jax.video import OutputError
+from firenet_jax.windows import Window
+
+HEIGHT, WIDTH = 20, 28
+PERIOD = 40_000  # microseconds
+NAMES = ("ours", "e2vid-random", "hf", "mr")
+
+
+def moving_pattern(number):
+    """(H, W) uint8, moving by a pixel a frame to the right."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    return np.rint(127 + 90 * np.sin((x - number) / 3) * np.cos(y / 4)).astype(np.uint8)
+
+
+def events_of(count, last, seed=0):
+    rng = np.random.default_rng(seed)
+    columns = rng.integers(0, WIDTH, count), rng.integers(0, HEIGHT, count), rng.random(count) < 0.5
+    return Events.of(np.sort(rng.integers(0, last, count)), *columns)
+
+
+def write(path, frames=6, events=None, flow=True, period=PERIOD, begin=0):
+    """A sequence with pictures at begin, begin + period ..., 100 events a millisecond; its path."""
+    size = {"height": HEIGHT, "width": WIDTH}
+    velocity = np.stack([np.full((HEIGHT, WIDTH), v, np.float32) for v in (1e6 / period, 0)])
+    pictures = [
+        Picture(begin + n * period, moving_pattern(n), velocity if flow else None)
+        for n in range(frames)
+    ]
+    if events is None:
+        events = events_of(100 * frames * period // 1000, frames * period)
+    path.parent.mkdir(exist_ok=True, parents=True)
+    write_sequence(path, [events], pictures, **size)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two sequences of 5 and 8 windows, and weights of a FireNet."""
+    here = tmp_path_factory.mktemp("evaluate")
+    write(here / "data" / "a.h5", 6)
+    write(here / "data" / "b.h5", 9, flow=False)
+    save_weights(here / "ours.npz", Weights(initial_params(jax.random.key(0)), True))
+    return here
+
+
+def settings(folder, output, **changes):
+    standard = {"data": (folder / "data",), "weights": (folder / "ours.npz",), "e2vid_random": True}
+    return Evaluate(output=output, **(standard | changes))
+
+
+@pytest.fixture(scope="module")
+def evaluated(folder):
+    """(output folder, results) of all methods on both sequences."""
+    return folder / "out", run(settings(folder, folder / "out"))
+
+
+def direct(folder, name, sequence):
+    """[(number, image, frame)] of one method, windows cut by a mask."""
+    recording = open_recording(folder / "data" / f"{sequence}.h5")
+    found = load(["firenet", "e2vid", "hf", "mr"], [folder / "ours.npz"], e2vid_random=True)
+    method = next(method for method in found if method.name == name)
+    (events,) = recording.events()
+    state, images = method.initial(HEIGHT, WIDTH), []
+    times = recording.frames.times
+    for number in range(1, len(times)):
+        inside = (events.t >= times[number - 1]) & (events.t < times[number])
+        window = events.select(inside)
+        state, image = method.step(state, Window(window, int(window.t[-1])))
+        assert image.shape == (HEIGHT, WIDTH) and image.dtype == np.float32
+        frame = recording.frames.read(number).astype(np.float32) / 255
+        images.append((number, np.clip(np.asarray(image), 0, 1), frame))
+    return images
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_numbers_are_those_of_a_direct_computation(folder, evaluated, name):
+    entry = evaluated[1]["sequences"]["data-a"]["methods"][name]
+    images = direct(folder, name, "a")
+    assert entry["frames"] == entry["of"] == 5 and entry["frame_numbers"] == [1, 2, 3, 4, 5]
+    assert entry["times"] == pytest.approx([0.04, 0.08, 0.12, 0.16, 0.2])
+    mse = [np.mean((image - frame) ** 2) for _, image, frame in images]
+    ssim = [
+        structural_similarity(image, frame, gaussian_weights=True, sigma=1.5, data_range=1.0,
+                              use_sample_covariance=False)
+        for _, image, frame in images
+    ]  # fmt: skip
+    assert entry["values"]["mse"] == pytest.approx(mse, abs=1e-5)
+    assert entry["values"]["psnr"] == pytest.approx(-10 * np.log10(mse), abs=1e-3)
+    assert entry["values"]["ssim"] == pytest.approx(ssim, abs=1e-4)
+    assert entry["means"]["mse"] == pytest.approx(np.mean(mse), abs=1e-5)
+    for metric in ("ms_ssim", "haarpsi", "cw_ssim", "nlpd", "gmsd", "random_features"):
+        expected = [float(getattr(metrics, metric)(i, f)) for _, i, f in images]
+        assert entry["values"][metric] == pytest.approx(expected, abs=1e-4)
+    one = np.zeros((HEIGHT, WIDTH, 2), np.float32) + np.array([1, 0], np.float32).reshape(1, 1, 2)
+    pairs = zip(images[:-1], images[1:], strict=True)
+    flicker = [float(metrics.temporal_error(i, j, one, f, g)) for (_, j, g), (_, i, f) in pairs]
+    assert entry["values"]["temporal_error"][0] is None  # nothing came before
+    assert entry["values"]["temporal_error"][1:] == pytest.approx(flicker, abs=1e-5)
+
+
+def test_means_over_sequences_and_over_frames(evaluated):
+    results = evaluated[1]
+    for name in NAMES:
+        a, b = (results["sequences"][s]["methods"][name] for s in ("data-a", "data-b"))
+        over = {kind: means[name] for kind, means in results["means"].items()}
+        assert over["over frames"]["frames"] == 13
+        pair = a["means"]["ssim"], b["means"]["ssim"]
+        assert over["over sequences"]["means"]["ssim"] == pytest.approx(np.mean(pair))
+        weighed = np.average(pair, weights=[5, 8])
+        assert over["over frames"]["means"]["ssim"] == pytest.approx(weighed)
+        # one sequence has no flow: its gap has a name, the mean is that of the other
+        assert b["means"]["temporal_error"] is None and b["gaps"]["temporal_error"] == "no flow"
+        mean = over["over sequences"]["means"]["temporal_error"]
+        assert mean == pytest.approx(a["means"]["temporal_error"])
+
+
+def no_constant(name):
+    raise AssertionError(f"{name} in JSON")
+
+
+def test_json_and_csv_say_the_same(evaluated):
+    output, results = evaluated
+    text = (output / "results.json").read_text()
+    assert json.loads(text, parse_constant=no_constant) == json.loads(json.dumps(results))
+    with open(output / "table.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 4 * (2 + 2)
+    means = results["sequences"]["data-b"]["methods"]["hf"]["means"]
+    row = next(row for row in rows if (row["sequence"], row["method"]) == ("data-b", "hf"))
+    assert float(row["ssim"]) == means["ssim"] and row["temporal_error"] == ""
+    assert "temporal_error: no flow" in row["gaps"] and "lpips: no weights" in row["gaps"]
+
+
+class Page(HTMLParser):
+    VOID = ("meta", "img")
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.seen, self.links = [], [], []
+
+    def handle_starttag(self, tag, attributes):
+        self.seen.append(tag)
+        self.links += [v for k, v in attributes if k in ("src", "href", "data", "action", "poster")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):  # <line/> opens and closes
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_well_formed_and_needs_nothing_else(evaluated):
+    text = (evaluated[0] / "index.html").read_text()
+    page = Page()
+    page.feed(text)
+    page.close()
+    assert page.open == []
+    assert all(link.startswith(("data:", "#")) for link in page.links)
+    assert "script" not in page.seen and "link" not in page.seen and "url(" not in text
+    assert page.seen.count("video") == 2 and page.seen.count("svg") == 4 + 3
+    assert page.seen.count("img") == 2 * 3 * 5  # sequences, times, a frame and four methods
+    assert "histogram equalisation before metrics: none" in text and "data range 1" in text
+
+
+def test_the_command_prints_the_table_and_goes_on(folder, evaluated, capsys):
+    line = f"evaluate {folder / 'data'} -o {evaluated[0]} -c {folder / 'ours.npz'} --e2vid-random"
+    before = result_times(evaluated[0])
+    assert cli.main(line.split()) == 0
+    out = capsys.readouterr().out
+    for word in ("data-a", "mean over sequences", "mean over frames", "e2vid-random", "no flow",
+                 "data range 1", "equalisation before metrics: none", "index.html"):  # fmt: skip
+        assert word in out
+    assert result_times(evaluated[0]) == before  # nothing was computed again
+
+
+def result_times(output):
+    return {path: path.stat().st_mtime_ns for path in output.glob("results/*/*")}
+
+
+def test_an_interrupted_evaluation_goes_on(folder, tmp_path, monkeypatch):
+    ours = settings(folder, tmp_path / "out", methods="hf,mr")
+    whole = run(settings(folder, tmp_path / "whole", methods="hf,mr"))
+    original, calls = evaluate.evaluate, []
+
+    def killed(plan, method, *rest):
+        calls.append((plan.name, method.name))
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return original(plan, method, *rest)
+
+    monkeypatch.setattr(evaluate, "evaluate", killed)
+    with pytest.raises(KeyboardInterrupt):
+        run(ours)
+    assert not (tmp_path / "out" / "index.html").exists()
+    again = run(ours)
+    assert calls[3:] == calls[2:3] + [("data-b", "mr")]
+    for kind in again["means"]:
+        for name in ("hf", "mr"):
+            assert again["means"][kind][name]["means"] == whole["means"][kind][name]["means"]
+
+
+def test_other_settings_are_refused_by_name_and_replaced_when_told(folder, tmp_path):
+    data = (folder / "data" / "a.h5",)
+    run(settings(folder, tmp_path / "out", data=data, methods="hf"))
+    other = {"data": data, "methods": "hf", "equalise": "global"}
+    with pytest.raises(OutputError, match="equalise was none, now global"):
+        run(settings(folder, tmp_path / "out", **other))
+    found = run(settings(folder, tmp_path / "out", overwrite=True, **other))
+    assert "metrics: global" in " ".join(found["protocol"])
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "file").write_text("mine")
+    with pytest.raises(OutputError, match="something else"):
+        run(settings(folder, tmp_path / "mine", **other))
+
+
+# ---- What counts
+
+
+def test_a_prediction_counts_once_and_within_the_tolerance():
+    times = np.array([0, 1000, 2000, 3000])
+    moments = [0, 900, 1040, 1100, 1500, 2101, 2900, 3100]
+    found = list(matched(((t, f"at {t}") for t in moments), times, 100))
+    assert found == [(0, "at 0"), (1, "at 1040"), (3, "at 2900")]
+
+
+def test_intervals_of_the_event_camera_dataset(tmp_path):
+    assert evaluate.CUTS["office_zigzag"] == (5, 12) and evaluate.CUTS["poster_6dof"] == (5, 20)
+    events = events_of(3000, 3_000_000)
+    path = write(tmp_path / "slider_depth.h5", 31, events, period=100_000)
+    recording = open_recording(path)
+    (tmp_path / "mvsec_depth.zip").touch()
+    assert interval(tmp_path / "mvsec_depth.zip", Evaluate((path,), tmp_path)) == (0, np.inf)
+
+    def counted(**changes):
+        found = plan("a", recording, Evaluate((path,), tmp_path / "out", **changes))
+        begin = found.span[0] + events.t[0] / 1e6
+        return found.times[found.first] / 1e6, found.times[found.last - 1] / 1e6, begin
+
+    assert counted() == pytest.approx((1.0, 2.5, events.t[0] / 1e6))
+    assert counted(start=0.0) == pytest.approx((0.1, 3.0, events.t[0] / 1e6))
+    # a window before the first frame that counts is always there, else the warm-up's share
+    assert counted(warm_up=0.0) == pytest.approx((1.0, 2.5, 0.9))
+    assert counted(warm_up=0.35) == pytest.approx((1.0, 2.5, 0.6))
+    assert counted(start=1.0, stop=1.05, warm_up=0.2)[:2] == pytest.approx((1.0, 1.0))
+    with pytest.raises(evaluate.Gap, match="no frames from 7 to 8 s"):
+        counted(start=7.0, stop=8.0)
+
+
+def test_keep_ratio_thins_out_frames_alike_for_every_method(folder, tmp_path):
+    data = (folder / "data" / "b.h5",)
+    choices = {"data": data, "methods": "hf,mr", "keep_ratio": 0.5}
+    results = run(settings(folder, tmp_path / "out", **choices))
+    hf, mr = (results["sequences"]["b"]["methods"][name] for name in ("hf", "mr"))
+    assert hf["frame_numbers"] == mr["frame_numbers"] and hf["of"] == 3  # windows of 4 frames of 9
+    other = plan("b", open_recording(data[0]), Evaluate(data, tmp_path, keep_ratio=0.5, seed=1))
+    assert other.numbers.tolist() != hf["frame_numbers"]
+    with pytest.raises(ValueError, match="between frames only"):
+        Evaluate(data, tmp_path, keep_ratio=0.5, duration=10.0)
+
+
+def test_windows_of_events_and_of_time(folder, tmp_path):
+    data = (folder / "data" / "b.h5",)
+    # 100 events a ms: 50 events take half a millisecond, so that each frame has a prediction
+    for choice, count in [({"events": 50}, 8), ({"duration": 40.0}, 8), ({"duration": 33.0}, 0)]:
+        choice = choice | {"data": data, "methods": "hf", "tolerance": 0.6}
+        if count:
+            found = run(settings(folder, tmp_path / f"{choice}", **choice))
+            assert found["sequences"]["b"]["methods"]["hf"]["frames"] == count
+        else:
+            with pytest.raises(ValueError, match="no prediction within 0.6 ms"):
+                run(settings(folder, tmp_path / f"{choice}", **choice))
+
+
+# ---- What is wrong
+
+
+def test_gaps_have_names_and_the_rest_is_measured(folder, tmp_path, capsys):
+    data = tmp_path / "data"
+    whole = events_of(24_000, 6 * PERIOD)
+    pause = (whole.t < 2 * PERIOD) | (whole.t >= 4 * PERIOD)
+    write(data / "pause.h5", 6, whole.select(pause))
+    write(data / "later.h5", 6, whole, begin=10**9)
+    write(data / "earlier.h5", 6, Events(whole.t + 10**9, whole.x, whole.y, whole.p))
+    write(data / "noframes.h5", 0)
+    write(data / "silent.h5", 6, Events.empty())
+    write(data / "good.h5", 6)
+    results = run(settings(folder, tmp_path / "out", data=(data,), weights=(), methods="hf,e2vid",
+                           e2vid_random=False))  # fmt: skip
+    found = {k: v["methods"] for k, v in results["sequences"].items()}
+    assert all(entry["e2vid"]["gap"] for entry in found.values())
+    assert found["data-good"]["e2vid"]["gap"] == "no weights"
+    assert found["data-noframes"]["hf"]["gap"] == "no frames"
+    assert found["data-silent"]["hf"]["gap"] == "no events"
+    for name in ("later", "earlier"):
+        assert found[f"data-{name}"]["hf"]["gap"].startswith("no overlap in time: frames")
+    paused = found["data-pause"]["hf"]
+    assert paused["frames"] == 5 and paused["windows_without_events"] == 2
+    assert np.isfinite(paused["values"]["ssim"]).all()
+    out = capsys.readouterr().out
+    assert "data-pause: 2 windows without events" in out and "nan" not in out.lower()
+    assert results["means"]["over sequences"]["hf"]["sequences"] == 2
+    assert results["means"]["over sequences"]["e2vid"] == {"gap": "no weights"}
+
+
+def test_frames_of_another_size_and_nothing_at_all(folder, tmp_path):
+    ours = settings(folder, tmp_path / "out", methods="hf", sensor_size="30x20")
+    with pytest.raises(ValueError, match="frames are 28x20, the sensor is 30x20"):
+        run(ours)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="holds no recordings"):
+        run(settings(folder, tmp_path / "out", data=(tmp_path / "empty",)))
+    twice = (folder / "data" / "a.h5", folder / "data" / "a.h5")
+    with pytest.raises(ValueError, match="both named a"):
+        run(settings(folder, tmp_path / "out", data=twice))
+
+
+def test_weights_that_are_not_there_or_not_finite(folder, tmp_path):
+    with pytest.raises(CheckpointError, match="nowhere.npz"):
+        run(settings(folder, tmp_path / "out", weights=(tmp_path / "nowhere.npz",)))
+    with pytest.raises(ValueError, match="no method 'nonsense'"):
+        run(settings(folder, tmp_path / "out", methods="hf,nonsense"))
+    with pytest.raises(ValueError, match="two methods are named hf"):
+        load(["hf", "hf"])
+    assert load(["e2vid"]) == [Missing("e2vid", "no weights")]
+
+    params = initial_params(jax.random.key(0))
+    params["prediction"]["bias"] = params["prediction"]["bias"] + 3e38
+    params["prediction"]["kernel"] = params["prediction"]["kernel"] + 3e38
+    save_weights(tmp_path / "huge.npz", Weights(params, True))
+    ours = settings(
+        folder, tmp_path / "out", methods="firenet,hf", weights=(tmp_path / "huge.npz",)
+    )
+    found = run(ours)["sequences"]["data-a"]["methods"]
+    assert "is not finite" in found["huge"]["gap"] and "gap" not in found["hf"]
+
+
+@pytest.mark.parametrize(
+    "choice, message",
+    [
+        ({"data": ()}, "no data"), ({"keep_ratio": 0.0}, "keep ratio"),
+        ({"warm_up": -1.0}, "warm_up"), ({"tolerance": float("nan")}, "tolerance"),
+        ({"start": 3.0, "stop": 2.0}, "stop"), ({"events": 0}, "events"),
+        ({"events": 5, "duration": 5.0}, "one way"), ({"sensor_size": "240"}, "WIDTHxHEIGHT"),
+    ],
+)  # fmt: skip
+def test_impossible_settings(folder, tmp_path, choice, message):
+    with pytest.raises(ValueError, match=message):
+        settings(folder, tmp_path / "out", **choice)
+
+
+def test_nothing_recompiles_as_windows_vary(folder):
+    found = load(["firenet"], [folder / "ours.npz"])[0]
+    state = found.initial(HEIGHT, WIDTH)
+    state, _ = found.step(state, Window(events_of(10, 1000), 1000))
+    compiled = methods.reconstruct._cache_size(), methods.voxelise._cache_size()
+    for count in (0, 1, 77, 3000, 16_000):
+        state, _ = found.step(state, Window(events_of(count, 1000), 1000))
+    assert (methods.reconstruct._cache_size(), methods.voxelise._cache_size()) == compiled
+
+
+@pytest.mark.parametrize(
+    "low, high, expected",
+    [(0.1, 0.9, [0, 0.2, 0.4, 0.6, 0.8, 1.0]), (3, 3, None), (0, 0, None), (-5, 9, None)],
+)
+def test_ticks_are_few_round_and_enclose(low, high, expected):
+    ticks = steps(low, high)
+    assert 2 <= len(ticks) <= 7 and ticks[0] <= low and ticks[-1] >= high
+    assert expected is None or ticks == pytest.approx(expected)
+
+
+def test_metrics_are_known_by_name():
+    assert set(evaluate.COMPARED) | {"lpips", "temporal_error"} == set(METRICS)
+    assert all(callable(getattr(metrics, name)) for name in evaluate.COMPARED)
