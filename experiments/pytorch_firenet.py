@@ -1,9 +1,8 @@
 """FireNet in PyTorch, events to picture and training: the other side of `xla_vs_pytorch.py`.
 
 The same functions as in the package, in the order of memory that PyTorch prefers: event tensors
-are (B, 5, H, W), images (B, H, W), those of a sequence (T, B, ...). What a compiler is not needed
-for is as quick as we could write it; `separate_gates` and `voxelise_original` are how the field's
-programs do it.
+are (B, 5, H, W), images (B, H, W), those of a sequence (T, B, ...). As quick as we could write it
+without a compiler; `separate_gates` and `voxelise_original` are how the field's programs do it.
 """
 
 from functools import lru_cache, partial

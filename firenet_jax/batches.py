@@ -45,26 +45,26 @@ class Augment:
 
     flip: float = 0.5
     """Probability of a flip, left to right and, drawn apart, top to bottom."""
-    pause: float = 0.05
+    pauses: float = 0.05
     """Probability that the camera stops: a window without events, the image before again."""
     stay: float = 0.9
     """Probability that a camera that stands still does so for another window."""
-    hot: float = 1e-3
+    hot_pixels: float = 1e-3
     """Greatest share of hot pixels, whose value in all bins of a run is higher or lower by a
     standard normal number."""
-    noise: float = 0.0
+    voxel_noise: float = 0.0
     """Standard deviation of normal noise in all entries of the tensors, also those of pauses. 0.1
     in FireNet+, whose tensors were not normalised: normalised, a pause would be noise of 1."""
 
     def __post_init__(self):
-        for name in ("flip", "pause", "stay", "hot"):
+        for name in ("flip", "pauses", "stay", "hot_pixels"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, but must be between 0 and 1")
-        if not 0 <= self.noise < np.inf:
-            raise ValueError(f"noise is {self.noise}, but must be 0 or more")
+        if not 0 <= self.voxel_noise < np.inf:
+            raise ValueError(f"voxel_noise is {self.voxel_noise}, but must be 0 or more")
 
 
-NOTHING = Augment(flip=0.0, pause=0.0, hot=0.0, noise=0.0)
+NOTHING = Augment(flip=0.0, pauses=0.0, hot_pixels=0.0, voxel_noise=0.0)
 """For validation."""
 
 
@@ -259,7 +259,7 @@ def _pauses(numbers: np.ndarray, augment: Augment) -> np.ndarray:
     when the network cannot know what it saw."""
     paused = np.zeros(len(numbers), bool)
     for n in range(1, len(numbers)):
-        paused[n] = numbers[n] < (augment.stay if paused[n - 1] else augment.pause)
+        paused[n] = numbers[n] < (augment.stay if paused[n - 1] else augment.pauses)
     return paused
 
 
@@ -399,16 +399,16 @@ def _simulation(key: jax.Array, batch: Batch, augment: Augment) -> Simulation:
         share_key, place_key, value_key, noise_key = jax.random.split(
             jax.random.fold_in(key, number), 4
         )
-        share = augment.hot * jax.random.uniform(share_key)
+        share = augment.hot_pixels * jax.random.uniform(share_key)
         hot = jax.random.uniform(place_key, (height, width)) < share
         values = jnp.where(hot, jax.random.normal(value_key, (height, width)), 0.0)
         added = jnp.broadcast_to(values[None, :, :, None], (steps, height, width, BINS))
-        if augment.noise:
+        if augment.voxel_noise:
             noise_key = jax.random.fold_in(noise_key, batch.part)
-            added += augment.noise * jax.random.normal(noise_key, added.shape)
+            added += augment.voxel_noise * jax.random.normal(noise_key, added.shape)
         return added
 
-    if augment.hot or augment.noise:
+    if augment.hot_pixels or augment.voxel_noise:
         tensors += jax.vmap(faults, out_axes=1)(batch.numbers)
     known = jnp.isfinite(batch.displacement).all(-1)
     displacement = jnp.where(known[..., None], batch.displacement, 0.0)

@@ -86,7 +86,8 @@ class Evaluate:
     methods: str = "firenet,e2vid,hf,mr"
     """Of firenet, e2vid, hf (high-pass filter) and mr (manifold regularisation), with commas."""
     weights: Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-c"])] = ()
-    """Weights of FireNet or FireNet+: each file is a method named after it."""
+    """Weights of FireNet or FireNet+: each file is a method named after it. Without any: those
+    that come with the package."""
     e2vid_weights: Path | None = None
     """E2VID's published checkpoint, or E2VID+'s."""
     e2vid_sigmoid: bool = True
@@ -442,9 +443,12 @@ class Numbers:
     """The numbers of one method's images of one sequence, batch by batch."""
 
     def __init__(self, plan: Plan, settings: Evaluate, learned: lpips.Lpips | None):
-        self.plan, self.kind, self.learned = plan, settings.equalise, learned
+        self.plan, self.kind = plan, settings.equalise
+        small = min(plan.recording.height, plan.recording.width) < lpips.SMALLEST
+        self.learned = None if small else learned
+        self.no_lpips = "no weights" if learned is None else "pictures too small"
         self.places: list[int] = []
-        self.values = {name: [] for name in METRICS if name != "lpips" or learned}
+        self.values = {name: [] for name in METRICS if name != "lpips" or self.learned}
         self.last: tuple[int, np.ndarray, np.ndarray] | None = None  # place, image, truth
 
     def add(self, batch: list[Comparison]) -> tuple[np.ndarray, np.ndarray]:
@@ -500,7 +504,7 @@ class Numbers:
                 gaps[name] = "no flow"
             values[name] = [v if ok else None for v, ok in zip(series, good, strict=True)]
         if not self.learned:
-            gaps["lpips"] = "no weights"
+            gaps["lpips"] = self.no_lpips
         return {
             "frames": len(self.places),
             "of": self.plan.last - self.plan.first,

@@ -182,11 +182,11 @@ def page(results: dict, shown: dict[str, Shown]) -> str:
         "<!DOCTYPE html>",
         '<html lang="en"><head><meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>firenet evaluate: {len(sequences)} sequences</title>",
+        f"<title>firenet evaluate: {escape(', '.join(colours))}</title>",
         f"<style>{STYLE}</style></head><body>",
         "<h1>Reconstructions beside camera frames</h1>",
-        f"<p>{len(sequences)} sequences, {len(colours)} methods: "
-        f"{escape(', '.join(colours))}. The best number of each column is marked.</p>",
+        f"<p>Sequences: {len(sequences)}. Methods: {escape(', '.join(colours))}. The best number "
+        "of each column is marked. Pictures are shown as they were compared.</p>",
     ]
     for kind, title in (
         ("over sequences", "Mean over sequences"),

@@ -397,9 +397,10 @@ def validate(params, data: Simulation, settings: Train):
 # ---- Runs
 
 
-def run(settings: Train) -> None:
+def run(settings: Train, stop: int | None = None) -> None:
     """Trains as the settings say, going on where an interrupted run stopped.
 
+    stop: leave after so many steps, in the middle of the schedule.
     Raises ValueError where the settings do not fit the folder, the weights or the devices.
     """
     if settings.coordinator is not None:
@@ -421,16 +422,17 @@ def run(settings: Train) -> None:
         sources, validation = sources_of(settings, done)
         log = Log(folder, done)
         best, last_save = log.best(), time.monotonic()
-        with tqdm(total=settings.steps, initial=done, unit="step", disable=_bar()) as progress:
-            while done < settings.steps:
+        last = min(settings.steps, stop or settings.steps)
+        with tqdm(total=last, initial=done, unit="step", disable=_bar()) as progress:
+            while done < last:
                 state, terms = train_step(state, next(sources), settings)
                 done += 1
                 progress.update()
-                if done % settings.log_every == 0 or done == settings.steps:
+                if done % settings.log_every == 0 or done == last:
                     terms = log.write(done, "train", terms)
                     progress.set_postfix(loss=f"{terms['loss']:.3f}", refresh=False)
                     _check_finite(terms, state, folder)
-                if done % settings.validate_every == 0 or done == settings.steps:
+                if done % settings.validate_every == 0 or done == last:
                     results = [validate(state.params, make(), settings) for make in validation]
                     means = jax.tree.map(lambda *scores: np.mean(scores), *(r[0] for r in results))
                     means = log.write(done, "validation", means)
@@ -441,7 +443,7 @@ def run(settings: Train) -> None:
                         log.keep("weights.npz", weights)
                     log.keep("last.npz", weights)
                 logged = done % settings.log_every == 0
-                if done == settings.steps or (logged and _due(last_save, settings)):
+                if done == last or (logged and _due(last_save, settings)):
                     saved.save(done, args=ocp.args.StandardSave(state))
                     last_save = time.monotonic()
         log.close()

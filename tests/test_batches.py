@@ -109,7 +109,7 @@ def places(images):
 # ---- What a batch holds
 
 
-@pytest.mark.parametrize("augment", [NOTHING, replace(NOTHING, flip=0.5, pause=0.4, stay=0.5)])
+@pytest.mark.parametrize("augment", [NOTHING, replace(NOTHING, flip=0.5, pauses=0.4, stay=0.5)])
 def test_batches_hold_what_slow_loops_find_in_the_files(noise, augment):
     seen, still, gaps = set(), 0, np.diff(times())
     for data in take(noise, 4, augment=augment, seed=3):
@@ -147,7 +147,7 @@ def test_batches_hold_what_slow_loops_find_in_the_files(noise, augment):
                 assert (data.visible[t, b] == inside).mean() > 0.999  # rounding at the border
     assert {seed for seed, *_ in seen} == {0, 1, 2} and len(seen) == 4 * BATCH
     flips = {place[-2:] for place in seen}
-    assert len(flips) == (4 if augment.flip else 1) and bool(still) == bool(augment.pause)
+    assert len(flips) == (4 if augment.flip else 1) and bool(still) == bool(augment.pauses)
 
 
 @pytest.mark.parametrize("flip", [0.0, 0.5])
@@ -175,7 +175,11 @@ def test_pauses_are_as_often_and_as_long_as_asked():
 def test_hot_pixels_stay_and_noise_does_not(noise):
     bare, hot, noisy = (
         take(noise, 3, chain=2, augment=augment)
-        for augment in (NOTHING, replace(NOTHING, hot=0.5), replace(NOTHING, noise=0.1))
+        for augment in (
+            NOTHING,
+            replace(NOTHING, hot_pixels=0.5),
+            replace(NOTHING, voxel_noise=0.1),
+        )
     )
     added = [b.tensors - a.tensors for a, b in zip(bare, hot, strict=True)]
     values = added[0][0, :, :, :, 0]  # (B, S, S)
@@ -194,7 +198,7 @@ def test_hot_pixels_stay_and_noise_does_not(noise):
 
 
 def test_a_chain_goes_on_where_its_last_part_ended(noise):
-    pausing = replace(NOTHING, flip=0.5, pause=0.3, stay=0.5)
+    pausing = replace(NOTHING, flip=0.5, pauses=0.3, stay=0.5)
     parts = take(noise, 6, chain=3, augment=pausing, seed=1)
     for chain in (parts[:3], parts[3:]):
         for b in range(BATCH):
@@ -214,7 +218,7 @@ def test_each_file_has_its_turn_in_every_pass(noise):
 
 def test_without_flow_nothing_is_visible_but_in_pauses(tmp_path):
     file = write(tmp_path / "a.h5", random_events(0), moving_pictures(flow=False))
-    data = take([file], 2, augment=replace(NOTHING, pause=0.5))[1]
+    data = take([file], 2, augment=replace(NOTHING, pauses=0.5))[1]
     assert not data.displacement.any()
     np.testing.assert_array_equal(data.visible.any((2, 3)), ~data.tensors.any((2, 3, 4)))
     assert data.visible.any()
@@ -250,7 +254,7 @@ def test_sets_that_firenet_simulates(tmp_path, monkeypatch):
 
 
 def test_a_batch_depends_on_seed_and_number_alone(noise):
-    faulty = Augment(hot=0.1, noise=0.1)
+    faulty = Augment(hot_pixels=0.1, voxel_noise=0.1)
     run = take(noise, 5, augment=faulty, seed=5)
     again = take(noise, 2, augment=faulty, seed=5, first=3)
     assert same(run[3], again[0]) and same(run[4], again[1])
@@ -359,7 +363,9 @@ def test_short_files_are_left_out_with_a_warning(tmp_path, noise, caplog):
     refused(short)
 
 
-@pytest.mark.parametrize("wrong", [{"flip": 1.1}, {"stay": -0.1}, {"noise": -1}, {"hot": np.nan}])
+@pytest.mark.parametrize(
+    "wrong", [{"flip": 1.1}, {"stay": -0.1}, {"voxel_noise": -1}, {"hot_pixels": np.nan}]
+)
 def test_settings_that_cannot_be_are_said(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))} is"):
         Augment(**wrong)

@@ -278,6 +278,32 @@ def test_keep_ratio_thins_out_frames_alike_for_every_method(folder, tmp_path):
         Evaluate(data, tmp_path, keep_ratio=0.5, duration=10.0)
 
 
+def test_lpips_where_files_are_named_and_pictures_large_enough(folder, tmp_path, monkeypatch):
+    """Its numbers are tested where it is; here that they get to the table."""
+    fake = evaluate.lpips.Lpips({}, (np.ones(3, np.float32),))
+    monkeypatch.setattr(evaluate.lpips, "load", lambda *files: fake)
+    monkeypatch.setattr(evaluate.lpips, "lpips", lambda _, image, truth: metrics.mse(image, truth))
+    choices = {"data": (folder / "data" / "a.h5",), "methods": "hf", "lpips": (tmp_path, tmp_path)}
+    found = run(settings(folder, tmp_path / "small", **choices))
+    entry = found["sequences"]["a"]["methods"]["hf"]
+    assert entry["means"]["lpips"] is None and entry["gaps"]["lpips"] == "pictures too small"
+    monkeypatch.setattr(evaluate.lpips, "SMALLEST", HEIGHT)
+    entry = run(settings(folder, tmp_path / "out", **choices))["sequences"]["a"]["methods"]["hf"]
+    assert entry["values"]["lpips"] == entry["values"]["mse"] and "lpips" not in entry["gaps"]
+
+
+@pytest.mark.parametrize("kind", ["local", "clahe"])
+def test_images_and_frames_are_equalised_before_metrics(folder, tmp_path, kind):
+    choices = {"data": (folder / "data" / "a.h5",), "methods": "hf", "equalise": kind}
+    entry = run(settings(folder, tmp_path / "out", **choices))["sequences"]["a"]["methods"]["hf"]
+    equalise = evaluate.equalise
+    mse = [
+        np.mean((equalise(image, kind) - equalise(frame, kind)) ** 2)
+        for _, image, frame in direct(folder, "hf", "a")
+    ]
+    assert entry["values"]["mse"] == pytest.approx(mse, abs=1e-5)
+
+
 def test_windows_of_events_and_of_time(folder, tmp_path):
     data = (folder / "data" / "b.h5",)
     # 100 events a ms: 50 events take half a millisecond, so that each frame has a prediction
