@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from harness import save
 from PIL import Image
-from train_default import SETTINGS
+from train_default import REAL as SETTINGS
 
 from firenet_jax import metrics
 from firenet_jax.checkpoint import load_weights

@@ -3,11 +3,9 @@
     python experiments/train_default.py RUN --images PICTURES      2 hours on two cores
     python experiments/train_default.py RUN --report-only          what it was and how it went
 
-Three stages, each in a folder of its own under RUN and from the last weights of the one before; an
-interrupted stage goes on where it was. First many kinds of motion and faults, only until the
-network has the gist (`FIRST` steps of its schedule); then clean sensors and windows in which much
-moves, because there is most to learn from them; then the faults of real sensors again, longer
-sequences and slower ones.
+Two stages, each in a folder of its own under RUN; an interrupted one goes on where it was. First
+clean sensors and windows in which much moves, because there is most to learn from them; then, from
+the last weights of that, the faults of real sensors, longer sequences and slower ones.
 
 PICTURES were 63: scikit-image's own (`scenes.PHOTOGRAPHS`), matplotlib's sample data, and those
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
@@ -32,64 +30,49 @@ from firenet_jax.train import Train, run
 matplotlib.use("agg")
 import matplotlib.pyplot as plt  # noqa: E402
 
-FIRST = 600  # steps of the first stage's schedule
-# Half of the sequences have next to no noise, the others as much as real sensors in the dark.
-SENSOR = replace(
-    FAULTY,
-    threshold_range=(0.1, 0.5),
-    noise=(0.003, 5.0),
-    leak=(0.003, 0.3),
-    hot=(1e-6, 1e-3),
-    cutoff=(100.0, 2000.0),
-)
-SETTINGS = Train(
+CLEAN = Train(
     output=Path("run"),
     textures=768,
     procedural=0.2,
-    steps=4200,
-    batch=3,
-    crop=80,
-    windows=16,
-    chain=4,
-    renderings=8,
-    motion=(0.3, 4.0),
-    learning_rate=1e-3,
-    scene=SceneSettings(objects=2),
-    sensor=SENSOR,
-    validate_every=300,
-)
-CLEAN = replace(
-    SETTINGS,
-    steps=1200,
+    steps=2400,
     batch=2,
     crop=96,
     windows=20,
     chain=2,
     renderings=10,
     motion=(1.5, 5.0),
-    learning_rate=1.5e-3,
-    warmup=50,
+    learning_rate=1e-3,
+    warmup=200,
+    loss=Loss(l1=0.5, nlpd=0.5, ssim=1.0),
     scene=SceneSettings(objects=2, pause=0.1, speed=(10.0, 1000.0)),
     sensor=SensorSettings(threshold_range=(0.1, 0.5), mismatch=0.02, refractory_range=(1e-4, 1e-3)),
     validate_every=200,
 )
+STOP = 1000  # steps of the first stage's schedule, while its rate is still high
 REAL = replace(
     CLEAN,
     steps=1500,
     chain=4,
     motion=(0.6, 5.0),
     learning_rate=1e-3,
-    loss=Loss(l1=0.5, nlpd=0.5, ssim=1.0),
+    warmup=50,
     scene=SceneSettings(objects=2, pause=0.2),
-    sensor=SENSOR,
+    # Half of the sequences have next to no noise, the others as much as real sensors in the dark.
+    sensor=replace(
+        FAULTY,
+        threshold_range=(0.1, 0.5),
+        noise=(0.003, 5.0),
+        leak=(0.003, 0.3),
+        hot=(1e-6, 1e-3),
+        cutoff=(100.0, 2000.0),
+    ),
 )
-STAGES = {"first": SETTINGS, "clean": CLEAN, "real": REAL}
+STAGES = {"clean": (CLEAN, STOP), "real": (REAL, None)}
 
 
 def train(folder: Path, images: Path) -> None:
     weights = None
-    for name, settings in STAGES.items():
-        stop = FIRST if name == "first" else None
+    for name, (settings, stop) in STAGES.items():
         run(replace(settings, output=folder / name, images=images, weights=weights), stop)
         weights = folder / name / "last.npz"
 

@@ -1,0 +1,54 @@
+"""Figure 3 of the paper: what each method makes of the same events, beside the camera's frame.
+
+Question: how do HF, MR, E2VID and FireNet look? A row for each sequence; windows lie between
+frames, and the picture is the last after `--seconds` of events. Without recordings the sequences
+are simulated. E2VID is a named gap unless its checkpoint is given.
+
+    python experiments/figure3_qualitative.py [RECORDING...] [--e2vid-weights FILE]     2 minutes
+
+Writes docs/figure3_qualitative.jpg.
+"""
+
+from figures import (
+    about_data,
+    about_weights,
+    arguments,
+    conditions,
+    event_picture,
+    gaps,
+    grid,
+    last_image,
+    load_methods,
+    picture,
+    save_figure,
+    windows_of,
+    with_recordings,
+)
+
+from firenet_jax.windows import Windows
+
+
+def main():
+    parser = with_recordings(arguments(__doc__, seconds=2.0))
+    parser.add_argument("--equalise", choices=("none", "global", "local", "clahe"), default="none")
+    options = parser.parse_args()
+    methods = load_methods(["hf", "mr", "e2vid", "firenet"], options)
+    rows = []
+    for sequence in conditions(options):
+        recording = sequence.recording
+        windows = windows_of(sequence, Windows(between_frames=True))
+        made = [last_image(method, windows, recording) for method in methods.values()]
+        shown = [picture(i, options.equalise) for i in (*made, sequence.truth(windows[-1].time))]
+        rows.append((sequence.name, [event_picture(windows[-1], recording), *shown]))
+    sheet = grid(["events", *methods, "frame"], rows, cell=200)
+    caption = [
+        about_data(options.recordings),
+        f"Windows between frames; equalisation: {options.equalise}; HF after a bilateral filter, "
+        f"sigma 25; FireNet: {about_weights(options)}.",
+        *gaps(methods),
+    ]
+    save_figure(options.out / "figure3_qualitative.jpg", [sheet], " ".join(caption))
+
+
+if __name__ == "__main__":
+    main()
