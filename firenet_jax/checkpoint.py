@@ -90,12 +90,8 @@ def load_weights(path: str | Path | None = None) -> Weights:
 
 
 def _load_default() -> Weights:
+    """Those that come with the package; docs/model_card.md says how they were made."""
     file = importlib.resources.files("firenet_jax") / "weights" / "firenet.npz"
-    if not file.is_file():
-        raise CheckpointError(
-            "no weights come with this version; pass --weights FILE, a .npz written by this "
-            "program or a published FireNet checkpoint (.pth)"
-        )
     with importlib.resources.as_file(file) as path:
         return _load_npz(path)
 

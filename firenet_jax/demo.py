@@ -55,7 +55,8 @@ class Demo:
     """A name that ends in .mp4 or .gif, or a folder for png files: events (blue: brighter, red:
     darker), reconstruction and truth, at natural speed."""
     weights: Annotated[Path | None, tyro.conf.arg(aliases=["-c"])] = None
-    """Weights: .npz, a published PyTorch checkpoint, or the folder of a training run."""
+    """Weights: .npz, a published PyTorch checkpoint, or the folder of a training run. Without:
+    those that come with the package."""
     seconds: float = 3.0
     """How long the scene lasts."""
     fps: float = 30.0

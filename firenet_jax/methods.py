@@ -22,7 +22,6 @@ from firenet_jax.baselines import e2vid, high_pass, manifold
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.events import logger
 from firenet_jax.network import Weights, initial_state
-from firenet_jax.pytorch_file import CheckpointError
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.tensors import normalise, pack, voxelise
 from firenet_jax.windows import Window
@@ -76,17 +75,15 @@ def load(
         if name == "firenet" and weights:
             found += [firenet(path.resolve().stem, load_weights(path)) for path in weights]
         elif name == "firenet":
-            try:
-                found.append(firenet(name, load_weights()))
-            except CheckpointError:
-                found.append(_missing(name, "--weights"))
+            found.append(firenet(name, load_weights()))
         elif name == "e2vid" and e2vid_weights is not None:
             found.append(recurrent_unet(name, *e2vid.load(e2vid_weights, sigmoid=e2vid_sigmoid)))
         elif name == "e2vid" and e2vid_random:
             params = e2vid.initial_params(jax.random.key(0))
             found.append(recurrent_unet("e2vid-random", params))
         elif name == "e2vid":
-            found.append(_missing(name, "--e2vid-weights"))
+            logger.warning("e2vid has no weights and is left out: pass --e2vid-weights FILE")
+            found.append(Missing(name, "no weights"))
         elif name == "hf":
             found.append(filtered(name))
         else:
@@ -98,11 +95,6 @@ def load(
             f"two methods are named {twice}: rename a file of weights, or name it once"
         )
     return found
-
-
-def _missing(name: str, option: str) -> Missing:
-    logger.warning("%s has no weights and is left out: pass %s FILE", name, option)
-    return Missing(name, "no weights")
 
 
 def firenet(name: str, weights: Weights) -> Method:

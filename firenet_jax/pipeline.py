@@ -65,7 +65,8 @@ class Reconstruct:
     """A folder (for png files and timestamps.txt), or a name that ends in .mp4 or .gif. With
     several recordings one entry each, named after them, in the folder of that name."""
     weights: Annotated[Path | None, tyro.conf.arg(aliases=["-c"])] = None
-    """Weights: .npz, a published PyTorch checkpoint, or the folder of a training run."""
+    """Weights: .npz, a published PyTorch checkpoint, or the folder of a training run. Without:
+    those that come with the package."""
     windows: Windows = Windows()
     network: Network = Network()
     display: Display = Display()

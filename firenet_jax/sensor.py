@@ -152,7 +152,9 @@ def random_sensor(
     return Sensor(
         on=on,
         off=off,
-        refractory=None if refractory is None else (refractory * 1e6 * TICKS).astype(jnp.int32),
+        refractory=None
+        if refractory is None
+        else jnp.round(refractory * 1e6 * TICKS).astype(jnp.int32),
         drift=drift,
         noise=log_uniform(settings.noise) if settings.noise[1] else None,
         cutoff=jnp.stack([log_uniform(settings.cutoff), jnp.float32(settings.cutoff_dark)])

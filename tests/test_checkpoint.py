@@ -220,11 +220,11 @@ def test_pytorch_endings(tmp_path, name):
 
 
 def test_weights_that_come_with_the_package():
-    if (importlib.resources.files("firenet_jax") / "weights" / "firenet.npz").is_file():
-        assert load_weights().normalise in (True, False)
-    else:
-        with pytest.raises(CheckpointError, match="pass --weights FILE, a .npz"):
-            load_weights()
+    weights = load_weights()
+    assert weights.normalise
+    assert sum(leaf.size for leaf in jax.tree.leaves(weights.params)) == 37_777
+    file = importlib.resources.files("firenet_jax") / "weights" / "firenet.npz"
+    assert len(file.read_bytes()) < 1_000_000
 
 
 # ---- PyTorch

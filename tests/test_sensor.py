@@ -322,7 +322,7 @@ SETTINGS = dict(batch=B, windows=T, renderings=RENDERINGS, motion=(2.0, 2.5), **
 
 @pytest.fixture(scope="module")
 def textures():
-    return load_textures(None, 8, 64, seed=1)
+    return load_textures(None, 8, 64, seed=2)
 
 
 @pytest.fixture(scope="module")
