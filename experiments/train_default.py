@@ -94,7 +94,7 @@ def report(folder: Path) -> None:
         stages[name]["settings"].pop("images")
         stages[name]["settings"].pop("weights")
         done, seconds = done + stages[name]["steps"], seconds + stages[name]["seconds"]
-    axes.set(xlabel="steps", ylabel="SSIM on each stage's own validation sequences")
+    axes.set(xlabel="steps", ylabel="validation SSIM, each stage's own")
     axes.legend()
     axes.grid(alpha=0.3)
     figure.savefig(RESULTS / "train_default.png", dpi=100)
