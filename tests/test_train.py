@@ -29,9 +29,12 @@ def tiny(folder, **kwargs):
     return Train(folder, **(choices | kwargs))
 
 
+def entries(folder):
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
 def losses(folder):
-    entries = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-    return [(e["step"], e["kind"], e["loss"]) for e in entries]
+    return [(e["step"], e["kind"], e["loss"]) for e in entries(folder)]
 
 
 class Killed(Exception):
@@ -74,9 +77,9 @@ from firenet_jax.train import Train, run
 
 folder, chain, *where = sys.argv[1:]
 coordinator, processes, process = (where[0], int(where[1]), int(where[2])) if where else [None] * 3
-run(Train(Path(folder), steps=10, batch=4, crop=32, windows=3, warmup=1, textures=4, log_every=1,
+run(Train(Path(folder), batch=4, crop=32, windows=3, textures=4, log_every=1,
     validate_every=10, save_every=0.0, loss=Loss(l0=1), scene=SceneSettings(objects=0),
-    chain=int(chain), coordinator=coordinator, processes=processes, process=process))
+    chain=int(chain), coordinator=coordinator, processes=processes, process=process), stop=10)
 """
 
 
@@ -110,12 +113,14 @@ def test_four_devices_and_two_processes_learn_what_one_device_learns(tmp_path):
     two = [start(tmp_path / "two", 2, address, 2, process) for process in range(2)]
     finish(*two)
 
-    one, four, two = (losses(tmp_path / name) for name in ("one", "four", "two"))
+    one, four, two = (entries(tmp_path / name) for name in ("one", "four", "two"))
     assert len(one) == 11
     for others in (four, two):
-        for (step, kind, loss), other in zip(one, others, strict=True):
-            assert other[:2] == (step, kind)
-            assert other[2] == pytest.approx(loss, rel=1e-5), (step, kind)
+        for entry, other in zip(one, others, strict=True):
+            assert (other["step"], other["kind"]) == (entry["step"], entry["kind"])
+            assert other["loss"] == pytest.approx(entry["loss"], rel=1e-5), entry
+            if entry["kind"] == "train":  # Adam would not tell a gradient from a multiple of it
+                assert other["gradient"] == pytest.approx(entry["gradient"], rel=1e-2), entry
     for name in ("one", "four", "two"):
         assert (tmp_path / name / "weights.npz").exists()
 
