@@ -1,6 +1,6 @@
 """Which reconstruction loss gives the best network, under equal training budgets?
 
-    python experiments/compare_losses.py RUNS [--images PICTURES] [--steps 400]     15 minutes each
+    python experiments/compare_losses.py RUNS [--images PICTURES] [--steps 400]     about an hour
 
 Each candidate trains from the same seed, on the same sequences and for as many steps, in a folder
 of its own under RUNS (an interrupted comparison goes on), and is judged on simulated sequences of
@@ -32,7 +32,7 @@ from firenet_jax.sensor import sequences
 from firenet_jax.train import run
 
 NONE = Loss(l1=0, nlpd=0, ssim=0)
-# Weights bring each sum to 0.6 to 0.9 for a young network, so that lambda_tc means the same.
+# Weights that should bring each sum near the default's, so that lambda_tc means the same.
 CANDIDATES = {
     "l1": replace(NONE, l1=5.0),
     "nlpd": replace(NONE, nlpd=1.0),

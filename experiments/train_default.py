@@ -1,6 +1,6 @@
 """The run that made the built-in weights, `firenet_jax/weights/firenet.npz`.
 
-    python experiments/train_default.py RUN --images PICTURES      2 hours on two cores
+    python experiments/train_default.py RUN --images PICTURES      45 minutes on two cores
     python experiments/train_default.py RUN --report-only          what it was and how it went
 
 Two stages, each in a folder of its own under RUN; an interrupted one goes on where it was. First
