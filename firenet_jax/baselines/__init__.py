@@ -1,1 +1,1 @@
-"""Window -> image: the methods that FireNet is measured against, each as the body of a scan."""
+"""Window -> image: the methods that FireNet is measured against."""
