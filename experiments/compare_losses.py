@@ -79,7 +79,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", type=Path)
     parser.add_argument("--images", type=Path)
-    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--steps", type=int, default=300)
     options = parser.parse_args()
     budget = replace(
         SETTINGS,
@@ -90,7 +90,7 @@ def main():
         crop=64,
         chain=2,
         warmup=50,
-        learning_rate=2e-3,
+        learning_rate=3e-3,
         validate_every=options.steps,
     )
     for name, loss in CANDIDATES.items():

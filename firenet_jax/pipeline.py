@@ -1,7 +1,8 @@
 """Recordings -> pictures on disk: reading, device and writing overlapped, and resumable.
 
 Recordings of one sensor size run side by side in `batch` slots, each with its own state; a slot
-whose recording has ended takes the next. The host cuts windows and writes; everything between is
+whose recording has ended takes the next. The devices of a process share the slots, and processes
+the recordings. The host cuts windows and writes; everything between is
 the compiled program `reconstruction.events_to_pictures`. Memory holds a few chunks, whatever the
 length of the recordings.
 """
@@ -25,13 +26,14 @@ from tqdm import tqdm
 
 from firenet_jax import filters
 from firenet_jax.checkpoint import load_weights
+from firenet_jax.devices import BATCH, EVERYWHERE, check_processes, in_a_row, join, shared
 from firenet_jax.events import Events, Recording, RecordingError, logger, parse_size
 from firenet_jax.network import Weights
 from firenet_jax.overlap import ahead
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import Network, Session, events_to_pictures, initial_session
-from firenet_jax.tensors import Packed, capacity, pack
+from firenet_jax.tensors import IN_LISTS, Packed, pack_for_devices
 from firenet_jax.video import (
     VIDEOS,
     FolderWriter,
@@ -43,6 +45,9 @@ from firenet_jax.video import (
 )
 from firenet_jax.windows import Window, Windows, cut
 
+# Settings that the pictures do not depend on, or that are told in another way.
+ELSEWHERE = ("recordings", "output", "weights", "fps", "chunk", "batch", "overwrite")
+ELSEWHERE += ("coordinator", "processes", "process")
 RESUME_EVERY = 5.0  # seconds between two saves of what a resumed run needs
 
 
@@ -86,10 +91,16 @@ class Reconstruct:
     """WIDTHxHEIGHT of the sensor, such as 240x180, where the recording does not say it."""
     chunk: int | None = None
     """Windows a recording gives the device at once (default: 4 on a CPU, 16 elsewhere)."""
-    batch: int = 1
-    """Recordings that run side by side on the device."""
+    batch: int | None = None
+    """Recordings that run side by side, shared by the devices (default: one for each device)."""
     overwrite: bool = False
     """Replace an output that exists."""
+    coordinator: str | None = None
+    """host:port of process 0, where several processes share the recordings; start each so."""
+    processes: int | None = None
+    """How many processes."""
+    process: int | None = None
+    """Which one this is, from 0."""
 
     def __post_init__(self):
         for name in ("chunk", "batch", "fps"):
@@ -104,6 +115,7 @@ class Reconstruct:
             raise ValueError("no recording: name one or more files or folders")
         if self.stop is not None and self.stop <= (self.start or 0):
             raise ValueError(f"stop is {self.stop} s, but must come after the start")
+        check_processes(self.coordinator, self.processes, self.process)
 
 
 class Job(NamedTuple):
@@ -152,15 +164,20 @@ class Chunk(NamedTuple):
 
 
 def run(settings: Reconstruct) -> list[Path]:
-    """Does what the settings say; returns the outputs. Raises RecordingError, CheckpointError,
-    OutputError or ValueError with a message of one sentence."""
+    """Does what the settings say; returns the outputs, of several processes those of this one.
+
+    Raises RecordingError, CheckpointError, OutputError or ValueError, in one sentence."""
+    join(settings.coordinator, settings.processes, settings.process)
     weights = load_weights(settings.weights)
-    outputs = plan(settings.recordings, settings.output)
+    # Recordings have nothing to do with each other: processes deal them out and never talk.
+    mine = slice(jax.process_index(), None, jax.process_count())
+    outputs = plan(settings.recordings, settings.output)[mine]
+    if not outputs:
+        return []
     for output in outputs:
         check_output(output, settings.overwrite)
-    recordings = [
-        open_recording(path, parse_size(settings.sensor_size)) for path in settings.recordings
-    ]
+    size = parse_size(settings.sensor_size)
+    recordings = [open_recording(path, size) for path in settings.recordings[mine]]
     jobs = [
         Job(recording, output, describe(settings, recording, weights))
         for recording, output in zip(recordings, outputs, strict=True)
@@ -210,9 +227,12 @@ def reconstruct_jobs(
 ) -> tuple[int, int]:
     """Jobs of one sensor size -> their outputs on disk; returns (pictures, events) done."""
     height, width = jobs[0].recording.height, jobs[0].recording.width
-    slots = min(settings.batch, len(jobs))
-    weights = jax.device_put(weights)
-    chunks = ahead(in_chunks(jobs, settings, slots), depth=1)
+    wanted = min(settings.batch or jax.local_device_count(), len(jobs))
+    count = min(wanted, jax.local_device_count())
+    mesh = in_a_row(jax.local_devices()[:count]) if count > 1 else None
+    slots = -(-wanted // count) * count  # the same number on each device; some may stay empty
+    weights = jax.device_put(weights, shared(EVERYWHERE, mesh) if mesh else None)
+    chunks = ahead(in_chunks(jobs, settings, slots, count), depth=1)
 
     def device():
         """Chunk by chunk: (chunk, pictures on the host, states to keep for resuming, by slot).
@@ -226,8 +246,14 @@ def reconstruct_jobs(
         for chunk in chunks:
             for slot, start in chunk.starts.items():
                 session = _set_slot(session, slot, start)
+            events = chunk.events
+            if mesh:
+                session = jax.device_put(session, shared(BATCH, mesh))
+                events = jax.tree.map(
+                    lambda a, spec: jax.device_put(a, shared(spec, mesh)), events, IN_LISTS
+                )
             session, shown = events_to_pictures(
-                weights, session, chunk.events, chunk.valid, height=height, width=width,
+                weights, session, events, chunk.valid, height=height, width=width, mesh=mesh,
                 network=settings.network, settings=settings.display, preview=settings.preview,
             )  # fmt: skip
             states = {}
@@ -281,8 +307,8 @@ def _get_slot(session: Session, slot) -> Session:
     return jax.tree.map(lambda all: all[slot], session)
 
 
-def in_chunks(jobs: list[Job], settings: Reconstruct, slots: int) -> Iterator[Chunk]:
-    """Jobs -> chunks of T x B windows; a free slot takes the next job."""
+def in_chunks(jobs: list[Job], settings: Reconstruct, slots: int, devices: int) -> Iterator[Chunk]:
+    """Jobs -> chunks of T x B windows, B the slots; a free slot takes the next job."""
     steps = settings.chunk or (4 if jax.default_backend() == "cpu" else 16)
     waiting = iter(jobs)
     running: dict[int, Running] = {}
@@ -307,8 +333,9 @@ def in_chunks(jobs: list[Job], settings: Reconstruct, slots: int) -> Iterator[Ch
             if job.ahead is None:
                 del running[slot]
         count = sum(len(events) for row in rows for events in row)
-        size = capacity(count, size)
-        yield Chunk(pack(rows, size), count, valid, parts, starts)
+        events = pack_for_devices(rows, devices, size)
+        size = len(events.t) // devices
+        yield Chunk(events, count, valid, parts, starts)
 
 
 def start(job: Job, settings: Reconstruct) -> tuple[Running, Session]:
@@ -345,7 +372,7 @@ def describe(settings: Reconstruct, recording: Recording, weights: Weights) -> s
         digest.update(jax.tree_util.keystr(path).encode() + np.asarray(leaf).tobytes())
     status = recording.path.stat()
     choices = dataclasses.asdict(settings)
-    for name in ("recordings", "output", "weights", "fps", "chunk", "batch", "overwrite"):
+    for name in ELSEWHERE:
         del choices[name]
     return json.dumps(
         {

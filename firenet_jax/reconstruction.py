@@ -11,7 +11,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 
+from firenet_jax.devices import BATCH, EVERYWHERE, TIME_BATCH, on_each_device
 from firenet_jax.network import BINS, State, Weights, initial_state, step
 from firenet_jax.pictures import (
     Display,
@@ -20,7 +22,7 @@ from firenet_jax.pictures import (
     event_pictures,
     initial_display_state,
 )
-from firenet_jax.tensors import Packed, normalise, voxelise
+from firenet_jax.tensors import IN_LISTS, Packed, normalise, voxelise
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ def padding(height: int, width: int, multiple: int) -> tuple[tuple[int, int], tu
 
 @partial(
     jax.jit,
-    static_argnames=("height", "width", "network", "settings", "preview"),
+    static_argnames=("height", "width", "network", "settings", "preview", "mesh"),
 )
 def events_to_pictures(
     weights: Weights,
@@ -115,29 +117,38 @@ def events_to_pictures(
     network: Network = Network(),
     settings: Display = Display(),
     preview: bool = False,
+    mesh: Mesh | None = None,
 ) -> tuple[Session, jax.Array]:
     """(Session, the events of T x B windows) -> (Session, pictures), as one compiled program.
 
     Voxels, normalisation, padding, network, unsharp mask, intensity range, 8 bits. Pictures are
     (T, B, H, W) uint8; with preview (T, B, H, 2 W, 3): the events beside the reconstruction.
     valid: (T, B) bool, as in `reconstruct`.
+    mesh: devices that share the B recordings equally, for events from `pack_for_devices`.
     """
-    tensors = voxelise(events, height=height, width=width)
-    (top, bottom), (left, right) = sides = padding(height, width, network.pad)
-    inputs = normalise(tensors) if weights.normalise else tensors
-    inputs = jnp.pad(inputs, ((0, 0), (0, 0), *sides, (0, 0)), mode="reflect")
-    state, images = reconstruct(
-        Weights(weights.params, normalise=False),
-        session.network,
-        inputs,
-        valid,
-        recurrent=network.recurrent,
-        dtype=jnp.bfloat16 if network.bfloat16 else jnp.float32,
-    )
-    # The original program crops last: its mask and its range see the padded image.
-    shown, greys = display(session.display, images, valid, settings)
-    greys = greys[:, :, top : top + height, left : left + width]
-    if preview:
-        colours = jnp.broadcast_to(greys[..., None], (*greys.shape, 3))
-        greys = jnp.concatenate([event_pictures(tensors), colours], axis=-2)
-    return Session(state, shown), greys
+
+    def one_device(weights, session, events, valid):
+        tensors = voxelise(events, height=height, width=width)
+        (top, bottom), (left, right) = sides = padding(height, width, network.pad)
+        inputs = normalise(tensors) if weights.normalise else tensors
+        inputs = jnp.pad(inputs, ((0, 0), (0, 0), *sides, (0, 0)), mode="reflect")
+        state, images = reconstruct(
+            Weights(weights.params, normalise=False),
+            session.network,
+            inputs,
+            valid,
+            recurrent=network.recurrent,
+            dtype=jnp.bfloat16 if network.bfloat16 else jnp.float32,
+        )
+        # The original program crops last: its mask and its range see the padded image.
+        shown, greys = display(session.display, images, valid, settings)
+        greys = greys[:, :, top : top + height, left : left + width]
+        if preview:
+            colours = jnp.broadcast_to(greys[..., None], (*greys.shape, 3))
+            greys = jnp.concatenate([event_pictures(tensors), colours], axis=-2)
+        return Session(state, shown), greys
+
+    if mesh is not None:
+        specs = EVERYWHERE, BATCH, IN_LISTS, TIME_BATCH
+        one_device = on_each_device(one_device, specs, (BATCH, TIME_BATCH), mesh)
+    return one_device(weights, session, events, valid)

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from firenet_jax.devices import BATCH, TIME_BATCH
 from firenet_jax.events import Events, Recording
 from firenet_jax.windows import Windows, cut
 
@@ -103,6 +104,28 @@ def pack(
         start = stop
     packed.window[start:] = len(flat)
     return packed
+
+
+# How the devices of `pack_for_devices` share its arrays.
+IN_LISTS = Packed(*[BATCH] * 5, t_min=TIME_BATCH, duration=TIME_BATCH)
+
+
+def pack_for_devices(
+    windows: Sequence[Sequence[Events]], devices: int, at_least: int = 0
+) -> Packed:
+    """T rows of B windows -> a list for each device, of B / devices recordings, one after another.
+
+    at_least: places of a list, as in `capacity`.
+    """
+    share = len(windows[0]) // devices
+    parts = [[row[k * share :][:share] for row in windows] for k in range(devices)]
+    events = max(sum(len(window) for row in part for window in row) for part in parts)
+    lists = [pack(part, capacity(events, at_least)) for part in parts]
+    if devices == 1:
+        return lists[0]
+    along = {"t_min": 1, "duration": 1}
+    columns = zip(Packed._fields, zip(*lists, strict=True), strict=True)
+    return Packed(*(np.concatenate(column, along.get(name, 0)) for name, column in columns))
 
 
 def _aligned(size: int, dtype) -> np.ndarray:

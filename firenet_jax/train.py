@@ -27,17 +27,16 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import optax.contrib
 import orbax.checkpoint as ocp
 import tyro
 from jax.experimental import multihost_utils
-from jax.sharding import AxisType, Mesh, NamedSharding
-from jax.sharding import PartitionSpec as P
 from PIL import Image
 from tensorboardX import SummaryWriter
 from tqdm import tqdm
@@ -45,6 +44,16 @@ from tqdm import tqdm
 from firenet_jax import metrics
 from firenet_jax.batches import NOTHING, Augment, batches, split
 from firenet_jax.checkpoint import load_weights, save_weights
+from firenet_jax.devices import (
+    BATCH,
+    EVERYWHERE,
+    TIME_BATCH,
+    check_processes,
+    everywhere,
+    join,
+    on_each_device,
+    shared,
+)
 from firenet_jax.events import logger
 from firenet_jax.losses import Loss, sequence_loss
 from firenet_jax.network import State, Weights, initial_params, initial_state, step
@@ -105,9 +114,12 @@ class Train:
     """Pixels by which the fastest point moves in a window, at most half of the renderings; drawn
     log-uniformly for a sequence."""
     learning_rate: float = 1e-3
-    """Greatest rate of Adam, after warming up; it then falls to a hundredth along a cosine."""
+    """Greatest rate, after warming up; it then falls to a hundredth along a cosine."""
     warmup: int = 200
     """Steps in which the rate rises from zero."""
+    optimiser: Literal["muon", "adam"] = "muon"
+    """muon learns more from a step (experiments/compare_optimisers.py); adam is the paper's. A
+    rate means the same for both: the size of an update."""
     clip: float = 1.0
     """Gradients are scaled down to this norm."""
     seed: int = 0
@@ -155,9 +167,7 @@ class Train:
             )
         if self.warmup >= self.steps:
             raise ValueError(f"warmup is {self.warmup} steps of {self.steps}: use fewer")
-        together = [self.coordinator, self.processes, self.process]
-        if None in together and together != [None] * 3:
-            raise ValueError("several processes need all of coordinator, processes and process")
+        check_processes(self.coordinator, self.processes, self.process)
 
 
 class TrainState(NamedTuple):
@@ -170,12 +180,28 @@ class TrainState(NamedTuple):
 
 
 def optimiser(settings: Train) -> optax.GradientTransformation:
-    """Adam with clipped gradients; a step whose gradient is not finite changes nothing."""
+    """Of clipped gradients; a step whose gradient is not finite changes nothing.
+
+    Muon (Jordan et al. 2024) makes the update of a kernel, as a matrix (9 inputs, outputs),
+    orthogonal; 0.2 is the root mean square of Adam's usual updates (Liu et al., arXiv 2502.16982).
+    Biases and the 1x1 convolution are Adam's in both cases.
+    """
     rate = optax.warmup_cosine_decay_schedule(
         0.0, settings.learning_rate, settings.warmup, settings.steps, settings.learning_rate / 100
     )
-    adam = optax.chain(optax.clip_by_global_norm(settings.clip), optax.adam(rate))
-    return optax.apply_if_finite(adam, max_consecutive_errors=10)
+    update = optax.adam(rate)
+    if settings.optimiser == "muon":
+        update = optax.contrib.muon(
+            rate, consistent_rms=0.2, muon_weight_dimension_numbers=_as_matrices
+        )
+    update = optax.chain(optax.clip_by_global_norm(settings.clip), update)
+    return optax.apply_if_finite(update, max_consecutive_errors=10)
+
+
+def _as_matrices(params):
+    """For each parameter which axes are a matrix's, or None where it is Adam's."""
+    matrix = optax.contrib.MuonDimensionNumbers(reduction_axis=(0, 1, 2), output_axis=3)
+    return jax.tree.map(lambda p: matrix if p.ndim == 4 and p.shape[0] > 1 else None, params)
 
 
 def initial_train_state(settings: Train) -> TrainState:
@@ -204,27 +230,6 @@ def initial_train_state(settings: Train) -> TrainState:
     return TrainState(*everywhere(state), carried)
 
 
-# ---- Many devices: each has some of the sequences of a batch, and all of the parameters
-
-BATCH = P("devices")  # the first axis of a state
-TIME_BATCH = P(None, "devices")  # the second one of what comes in windows
-
-
-def devices() -> Mesh:
-    """All devices of all processes, in a row."""
-    return jax.make_mesh((jax.device_count(),), ("devices",), axis_types=(AxisType.Auto,))
-
-
-def shared(spec: P = P()) -> NamedSharding:
-    """How an array lies on the devices: whole on each of them, or split along its batch."""
-    return NamedSharding(devices(), spec)
-
-
-def everywhere(tree):
-    """Arrays of the host -> the same on all devices of all processes."""
-    return jax.device_put(jax.tree.map(np.asarray, tree), shared())
-
-
 def _keys(settings: Train) -> list[jax.Array]:
     """The key of the training sequences, and those of the validation sequences."""
 
@@ -233,12 +238,6 @@ def _keys(settings: Train) -> list[jax.Array]:
         return [training, *jax.random.split(validation, VALIDATION)]
 
     return jax.jit(keys, out_shardings=shared())()  # devices of others take keys in no other way
-
-
-def _on_each_device(function, in_specs, out_specs):
-    return jax.shard_map(
-        function, mesh=devices(), in_specs=in_specs, out_specs=out_specs, check_vma=False
-    )
 
 
 # ---- Simulation
@@ -290,8 +289,8 @@ def _simulated(
         seen, data = simulate(sensors, scenes, bounds, seen, renderings=settings.renderings, **size)
         return data, (seen, remembered)
 
-    specs = BATCH, BATCH, TIME_BATCH, BATCH, P()
-    on_each = _on_each_device(one_device, specs, (TIME_BATCH, BATCH))
+    specs = BATCH, BATCH, TIME_BATCH, BATCH, EVERYWHERE
+    on_each = on_each_device(one_device, specs, (TIME_BATCH, BATCH))
     data, states = on_each(sensors, scenes, bounds, carried, part)
     return data, states, part > 0 if chain > 1 else False
 
@@ -328,8 +327,8 @@ def loss_of(params, data: Simulation, state: State | None, warm, settings: Train
     # A `warm` that is known, known it must stay: it is no argument of the program then.
     known = isinstance(warm, bool)
     function = partial(one_device, warm=warm) if known else one_device
-    specs = (P(), TIME_BATCH, BATCH) + (() if known else (P(),))
-    on_each = _on_each_device(function, specs, (P(), (BATCH, TIME_BATCH)))
+    specs = (EVERYWHERE, TIME_BATCH, BATCH) + (() if known else (EVERYWHERE,))
+    on_each = on_each_device(function, specs, (EVERYWHERE, (BATCH, TIME_BATCH)))
     (loss, terms), (last, images) = on_each(params, data, state, *(() if known else (warm,)))
     return loss, (terms, last, images)
 
@@ -403,8 +402,7 @@ def run(settings: Train, stop: int | None = None) -> None:
     stop: leave after so many steps, in the middle of the schedule.
     Raises ValueError where the settings do not fit the folder, the weights or the devices.
     """
-    if settings.coordinator is not None:
-        jax.distributed.initialize(settings.coordinator, settings.processes, settings.process)
+    join(settings.coordinator, settings.processes, settings.process)
     if settings.batch % jax.device_count():
         raise ValueError(
             f"batch is {settings.batch}, but the sequences of a batch are dealt out to "

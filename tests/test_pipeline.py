@@ -1,4 +1,6 @@
 import json
+import os
+import socket
 import subprocess
 import sys
 import textwrap
@@ -75,6 +77,64 @@ def test_a_batch_gives_what_each_recording_gives_alone(tmp_path, weights, batch)
         alone, expected = pictures_of(tmp_path / "alone" / path.stem)
         assert stamps == expected
         assert np.abs(together.astype(int) - alone).max() <= 1
+
+
+SHARED = """
+import sys
+from pathlib import Path
+from firenet_jax.pipeline import Reconstruct, run
+from firenet_jax.windows import Windows
+
+weights, folder, output, *where = sys.argv[1:]
+coordinator, processes, process = (where[0], int(where[1]), int(where[2])) if where else [None] * 3
+recordings = tuple(sorted(Path(folder).glob("*.txt")))
+run(Reconstruct(recordings, Path(output), Path(weights), Windows(events=100), chunk=4,
+    coordinator=coordinator, processes=processes, process=process))
+"""
+
+
+def start(*arguments, devices=1):
+    environment = os.environ | {
+        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+        "JAX_PLATFORMS": "cpu",
+    }
+    command = [sys.executable, "-c", SHARED, *map(str, arguments)]
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def finish(*processes):
+    try:
+        for process in processes:
+            _, errors = process.communicate(timeout=300)
+            assert process.returncode == 0, errors[-2000:]
+    finally:  # one that failed leaves the others waiting
+        for process in processes:
+            process.kill()
+            process.communicate()
+
+
+@pytest.mark.slow
+def test_devices_and_processes_share_recordings_and_give_the_same(tmp_path, weights):
+    """Five recordings on four devices, where slots are used again, and in two processes."""
+    (tmp_path / "in").mkdir()
+    lengths = (700, 2050, 400, 1200, 900)
+    for n in lengths:
+        write_recording(tmp_path / "in" / f"r{n}.txt", n, seed=n)
+    finish(start(weights, tmp_path / "in", tmp_path / "one"))
+    finish(start(weights, tmp_path / "in", tmp_path / "four", devices=4))
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        address = f"localhost:{free.getsockname()[1]}"
+    arguments = weights, tmp_path / "in", tmp_path / "two", address, 2
+    finish(*(start(*arguments, process) for process in range(2)))
+
+    for n in lengths:
+        expected, stamps = pictures_of(tmp_path / "one" / f"r{n}")
+        assert len(expected) == -(-n // 100)
+        for shared in ("four", "two"):
+            found, times = pictures_of(tmp_path / shared / f"r{n}")
+            assert times == stamps
+            assert np.abs(found.astype(int) - expected).max() <= 1
 
 
 class Interrupted(Exception):

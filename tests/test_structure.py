@@ -13,7 +13,17 @@ PACKAGE = Path(fj.__file__).parent
 
 # Left never imports right. Modules on one line do not import each other.
 LAYERS = [
-    ["events", "convolution", "pictures", "video", "overlap", "pytorch_file", "warp", "equalise"],
+    [
+        "events",
+        "convolution",
+        "pictures",
+        "video",
+        "overlap",
+        "pytorch_file",
+        "warp",
+        "equalise",
+        "devices",
+    ],
     ["readers", "windows", "network", "metrics", "scenes", "lpips"],
     ["filters", "tensors", "checkpoint", "losses"],
     ["reconstruction", "sensor"],
