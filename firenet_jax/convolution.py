@@ -1,9 +1,10 @@
-"""Image, kernel -> image: the convolution of all layers, whose gradient is quick on a CPU too.
+"""Image, kernel -> image: the convolution of all layers, quick on a CPU too, and its gradient.
 
 Images are (B, H, W, channels), kernels (rows, columns, inputs, outputs), odd sizes, zero padding,
-no striding. Forward and the gradient with respect to the image are XLA's convolutions everywhere.
-The gradient with respect to the kernel is XLA's on accelerators; on a CPU, inside a scan, XLA
-computes it in a way that takes many times as long as the matrix products below.
+no striding. Forward and the gradient with respect to the image are XLA's convolutions, on a CPU
+with few channels in another form. The gradient with respect to the kernel is XLA's on accelerators;
+on a CPU, inside a scan, XLA computes it in a way that takes many times as long as the matrix
+products below.
 """
 
 import jax
@@ -12,8 +13,40 @@ import jax.numpy as jnp
 DIMENSIONS = ("NHWC", "HWIO", "NHWC")
 
 
-def _convolve(image: jax.Array, kernel: jax.Array) -> jax.Array:
+def _plain(image: jax.Array, kernel: jax.Array) -> jax.Array:
     return jax.lax.conv_general_dilated(image, kernel, (1, 1), "SAME", dimension_numbers=DIMENSIONS)
+
+
+def _convolve(image: jax.Array, kernel: jax.Array) -> jax.Array:
+    _, columns, inputs, outputs = kernel.shape
+    if columns == 1 or inputs * outputs > 16 * 16:
+        return _plain(image, kernel)
+    return jax.lax.platform_dependent(image, kernel, cpu=in_pairs, default=_plain)
+
+
+def in_pairs(image: jax.Array, kernel: jax.Array) -> jax.Array:
+    """The same convolution with two pixels, side by side in a row, as one of twice the channels.
+
+    On a CPU, XLA spends about as long on 5 or 16 inputs as on 32: what it does for each pixel and
+    each place of the kernel costs more than the products. Half as many pixels and two columns of
+    pairs instead of three of pixels are a third of that, for 1.33 times the products (3 columns).
+    """
+    rows, columns, inputs, outputs = kernel.shape
+    batch, height, width, _ = image.shape
+    reach = (columns + 1) // 2  # pairs of inputs that a pair of outputs depends on
+    pairs = -(-width // 2)
+    before = columns // 2
+    after = 2 * (pairs + reach - 1) - width - before
+    image = jnp.pad(image, ((0, 0), (0, 0), (before, after), (0, 0)))
+    image = image.reshape(batch, height, pairs + reach - 1, 2 * inputs)
+    # The second pixel of a pair is reached by the same kernel, one pixel further to the right.
+    shifted = [jnp.pad(kernel, ((0, 0), (j, 1 - j), (0, 0), (0, 0))) for j in (0, 1)]
+    kernel = jnp.stack(shifted, 3).reshape(rows, reach, 2 * inputs, 2 * outputs)
+    padding = (rows // 2, rows // 2), (0, 0)
+    image = jax.lax.conv_general_dilated(
+        image, kernel, (1, 1), padding, dimension_numbers=DIMENSIONS
+    )
+    return image.reshape(batch, height, 2 * pairs, outputs)[:, :, :width]
 
 
 @jax.custom_vjp
@@ -39,7 +72,7 @@ convolve.defvjp(_forward, _backward)
 
 
 def _xla_kernel_gradient(image, kernel, gradient):
-    return jax.vjp(lambda kernel: _convolve(image, kernel), kernel)[1](gradient)[0]
+    return jax.vjp(lambda kernel: _plain(image, kernel), kernel)[1](gradient)[0]
 
 
 def kernel_gradient(image: jax.Array, kernel: jax.Array, gradient: jax.Array) -> jax.Array:

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from firenet_jax.convolution import convolve, kernel_gradient
+from firenet_jax.convolution import convolve, in_pairs, kernel_gradient
 
 
 def slow_convolution(image, kernel):
@@ -21,10 +21,10 @@ def slow_convolution(image, kernel):
     return result
 
 
-def random_case(shape, seed=0):
+def random_case(shape, seed=0, width=9):
     rows, columns, inputs, outputs = shape
     rng = np.random.default_rng(seed)
-    image = rng.normal(size=(2, 7, 9, inputs)).astype(np.float32)
+    image = rng.normal(size=(2, 7, width, inputs)).astype(np.float32)
     return image, rng.normal(size=shape).astype(np.float32)
 
 
@@ -35,6 +35,13 @@ SHAPES = [(3, 3, 5, 16), (1, 1, 16, 1), (3, 5, 4, 2)]
 def test_equals_the_loops(shape):
     image, kernel = random_case(shape)
     np.testing.assert_allclose(convolve(image, kernel), slow_convolution(image, kernel), atol=1e-4)
+
+
+@pytest.mark.parametrize("width", [1, 2, 3, 8, 9])
+@pytest.mark.parametrize("shape", [(3, 3, 16, 16), (3, 5, 4, 2), (1, 7, 2, 3)])
+def test_in_pairs_it_is_the_same_at_every_width(shape, width):
+    image, kernel = random_case(shape, width=width)
+    np.testing.assert_allclose(in_pairs(image, kernel), slow_convolution(image, kernel), atol=1e-4)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
