@@ -10,13 +10,23 @@ records. Once with the default 0.35 events per pixel in a window, once with 16 t
 Expected: linear in pixels, windows and batch; hardly dependent on the events until their cost
 reaches the network's, and then in stairs, because lists of events are padded to a few sizes.
 
-    python experiments/scaling.py            6 minutes on two cores
+Last, a folder of eight recordings on 1, 2 and 4 devices, and in 2 processes of one device
+(`firenet reconstruct`'s `run`, from text to PNG). These devices are virtual ones that share the
+cores of the CPU, two of them here: there is nothing to win, and what is measured is how much the
+dealing out costs.
+
+    python experiments/scaling.py            9 minutes on two cores
     python experiments/scaling.py --quick    1 minute; times mean nothing, saves nothing
 
 Writes results/scaling.json and .png (scaling_gpu on a GPU).
 """
 
 import argparse
+import os
+import socket
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 
 import jax
@@ -114,7 +124,62 @@ def real_time(sizes: list[tuple[int, int]], runs: int) -> list[dict]:
     return rows
 
 
-def plot(lines: dict[str, list[dict]], path: Path) -> None:
+DEVICES = """
+import sys, time
+from pathlib import Path
+from firenet_jax.pipeline import Reconstruct, run
+folder, output, *where = sys.argv[1:]
+coordinator, processes, process = (where[0], int(where[1]), int(where[2])) if where else [None] * 3
+recordings = tuple(sorted(Path(folder).glob("*.txt")))
+choices = dict(coordinator=coordinator, processes=processes, process=process, overwrite=True)
+run(Reconstruct(recordings, Path(output), **choices))
+start = time.perf_counter()
+run(Reconstruct(recordings, Path(output), overwrite=True))
+print("seconds", time.perf_counter() - start)
+"""
+
+
+def on_devices(recordings: int, events: int) -> list[dict]:
+    """A folder of recordings, dealt out to devices and to processes: seconds, once compiled."""
+    rows = []
+    print(f"\n{'devices':>10} {'processes':>10} {'s':>8} {'Mev/s':>8}")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for number in range(recordings):
+            made = random_events(events, POINT["width"], POINT["height"], number)
+            columns = zip(made.t.tolist(), made.x, made.y, made.p.astype(int), strict=True)
+            lines = "".join(f"{t / 1e6:.6f} {x} {y} {p}\n" for t, x, y, p in columns)
+            size = f"{POINT['width']} {POINT['height']}\n"
+            (folder / f"r{number}.txt").write_text(size + lines)
+        for devices, processes in ((1, 1), (2, 1), (4, 1), (1, 2)):
+            with socket.socket() as free:
+                free.bind(("localhost", 0))
+                address = f"localhost:{free.getsockname()[1]}"
+            environment = os.environ | {
+                "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+                "JAX_PLATFORMS": "cpu",
+            }
+            command = [sys.executable, "-c", DEVICES, folder, folder / f"out{devices}{processes}"]
+            started = [
+                subprocess.Popen(
+                    [*command, *([address, "2", str(process)] if processes > 1 else [])],
+                    env=environment,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.DEVNULL,
+                    text=True,
+                )  # fmt: skip
+                for process in range(processes)
+            ]
+            outputs = [process.communicate()[0] for process in started]
+            seconds = max(float(output.split("seconds")[1]) for output in outputs)
+            mev = 1e-6 * recordings * events / seconds
+            print(f"{devices:10} {processes:10} {seconds:8.2f} {mev:8.2f}")
+            row = {"devices": devices, "processes": processes}
+            rows.append(row | {"seconds": seconds, "mev_per_s": mev})
+    return rows
+
+
+def plot(lines: dict[str, list[dict]], shared: list[dict], path: Path) -> None:
     """Cost along each line, and dashed what it would be if it were linear from its last point."""
     labels = {
         "pixels": "pixels",
@@ -122,8 +187,8 @@ def plot(lines: dict[str, list[dict]], path: Path) -> None:
         "batch": "recordings side by side",
         "events_per_pixel": "events per pixel and window",
     }
-    figure, axes = plt.subplots(1, 4, figsize=(15, 3.8), sharey=True, layout="constrained")
-    for axis, (name, rows) in zip(axes, lines.items(), strict=True):
+    figure, axes = plt.subplots(1, 5, figsize=(18, 3.8), layout="constrained")
+    for axis, (name, rows) in zip(axes[:4], lines.items(), strict=True):
         places, middle = (np.array([row[key] for row in rows]) for key in ("at", "median_ms"))
         spread = [middle - [r["min_ms"] for r in rows], [r["max_ms"] for r in rows] - middle]
         axis.errorbar(places, middle, spread, fmt="o-", capsize=3, label="measured")
@@ -132,6 +197,9 @@ def plot(lines: dict[str, list[dict]], path: Path) -> None:
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("ms a chunk (median; least to greatest)")
     axes[0].legend()
+    names = [f"{row['devices']} dev.\n{row['processes']} proc." for row in shared]
+    axes[4].bar(names, [row["mev_per_s"] for row in shared])
+    axes[4].set(ylabel="Mev/s, text to PNG", xlabel="a folder of recordings, dealt out")
     point = (
         "{width}x{height}, {windows} windows, batch {batch}, {events_per_pixel} events per pixel"
     )
@@ -148,10 +216,12 @@ def main():
     runs = 2 if options.quick else options.runs
     lines = {name: line(name, changes[:few], runs) for name, changes in LINES.items()}
     limits = real_time(RESOLUTIONS[: 1 if options.quick else None], runs)
+    shared = on_devices(recordings=2, events=50_000) if options.quick else on_devices(8, 1_000_000)
     if not options.quick:
         name = on_this_device("scaling")
-        save(name, {"runs": runs, "point": POINT, "lines": lines, "real_time": limits})
-        plot(lines, RESULTS / f"{name}.png")
+        results = {"point": POINT, "lines": lines, "real_time": limits, "devices": shared}
+        save(name, {"runs": runs, **results})
+        plot(lines, shared, RESULTS / f"{name}.png")
 
 
 if __name__ == "__main__":

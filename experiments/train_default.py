@@ -42,6 +42,7 @@ CLEAN = Train(
     renderings=10,
     motion=(1.5, 5.0),
     learning_rate=1e-3,
+    optimiser="adam",
     warmup=200,
     loss=Loss(l1=0.5, nlpd=0.5, ssim=1.0),
     scene=SceneSettings(objects=2, pause=0.1, speed=(10.0, 1000.0)),
