@@ -28,7 +28,9 @@ HEIGHT, WIDTH = 480, 640
 RUN = """
 import resource, sys
 from firenet_jax import cli
-code = cli.main(["reconstruct", sys.argv[1], "-o", sys.argv[2], "--weights", sys.argv[3]])
+recording, output, weights = sys.argv[1:]
+sys.argv[1:] = ["reconstruct", recording, "-o", output, "--weights", weights]
+code = cli.program()
 print("peak", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 sys.exit(code)
 """

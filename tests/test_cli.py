@@ -1,6 +1,7 @@
 """What a user meets: exit codes, and one sentence for everything that is wrong."""
 
 import json
+import os
 import pickle
 import re
 import subprocess
@@ -45,6 +46,23 @@ def test_help_and_version(capsys):
             cli.main([command, "--help"])
         assert stop.value.code == 0
         assert f"firenet {command} " in capsys.readouterr().out  # an example
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only glibc has this setting")
+@pytest.mark.parametrize("chosen", [None, "glibc.malloc.check=0"])
+def test_the_program_runs_in_huge_pages_unless_told_otherwise(here, chosen):
+    """It starts itself again, with the arguments and the exit code that it had."""
+    script = (
+        "import os, sys; from firenet_jax import cli\n"
+        "cli.main = lambda: print(os.environ['GLIBC_TUNABLES'], sys.argv[1:]) or 3\n"
+        "sys.exit(cli.program())"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "GLIBC_TUNABLES"}
+    environment |= {"GLIBC_TUNABLES": chosen} if chosen else {}
+    command = [sys.executable, "-c", script, "info", "a b.txt"]
+    ran = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert ran.returncode == 3, ran.stderr
+    assert ran.stdout.strip() == f"{chosen or cli.HUGE_PAGES} ['info', 'a b.txt']"
 
 
 @pytest.mark.parametrize("output", ["out", "out.mp4", "out.gif"])
