@@ -1,6 +1,4 @@
 import json
-import os
-import socket
 import subprocess
 import sys
 import textwrap
@@ -9,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 from PIL import Image
+from processes import finish, start, together
 
 from firenet_jax import pipeline
 from firenet_jax.checkpoint import save_weights
@@ -93,26 +92,6 @@ run(Reconstruct(recordings, Path(output), Path(weights), Windows(events=100), ch
 """
 
 
-def start(*arguments, devices=1):
-    environment = os.environ | {
-        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
-        "JAX_PLATFORMS": "cpu",
-    }
-    command = [sys.executable, "-c", SHARED, *map(str, arguments)]
-    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
-
-
-def finish(*processes):
-    try:
-        for process in processes:
-            _, errors = process.communicate(timeout=300)
-            assert process.returncode == 0, errors[-2000:]
-    finally:  # one that failed leaves the others waiting
-        for process in processes:
-            process.kill()
-            process.communicate()
-
-
 @pytest.mark.slow
 def test_devices_and_processes_share_recordings_and_give_the_same(tmp_path, weights):
     """Five recordings on four devices, where slots are used again, and in two processes."""
@@ -120,13 +99,10 @@ def test_devices_and_processes_share_recordings_and_give_the_same(tmp_path, weig
     lengths = (700, 2050, 400, 1200, 900)
     for n in lengths:
         write_recording(tmp_path / "in" / f"r{n}.txt", n, seed=n)
-    finish(start(weights, tmp_path / "in", tmp_path / "one"))
-    finish(start(weights, tmp_path / "in", tmp_path / "four", devices=4))
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        address = f"localhost:{free.getsockname()[1]}"
-    arguments = weights, tmp_path / "in", tmp_path / "two", address, 2
-    finish(*(start(*arguments, process) for process in range(2)))
+    arguments = SHARED, weights, tmp_path / "in"
+    finish(start(*arguments, tmp_path / "one"))
+    finish(start(*arguments, tmp_path / "four", devices=4))
+    together(*arguments, tmp_path / "two")
 
     for n in lengths:
         expected, stamps = pictures_of(tmp_path / "one" / f"r{n}")

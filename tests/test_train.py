@@ -1,14 +1,11 @@
 import json
-import os
-import socket
-import subprocess
-import sys
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from processes import finish, start, together
 
 from firenet_jax import train
 from firenet_jax.checkpoint import load_weights, save_weights
@@ -83,35 +80,12 @@ run(Train(Path(folder), batch=4, crop=32, windows=3, textures=4, log_every=1,
 """
 
 
-def start(folder, *arguments, devices=1):
-    environment = os.environ | {
-        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
-        "JAX_PLATFORMS": "cpu",
-    }
-    command = [sys.executable, "-c", TOGETHER, str(folder), *map(str, arguments)]
-    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
-
-
-def finish(*processes):
-    try:
-        for process in processes:
-            _, errors = process.communicate(timeout=300)
-            assert process.returncode == 0, errors[-2000:]
-    finally:  # one that failed leaves the others waiting
-        for process in processes:
-            process.kill()
-            process.communicate()
-
-
 @pytest.mark.slow
 def test_four_devices_and_two_processes_learn_what_one_device_learns(tmp_path):
-    finish(start(tmp_path / "one", 2))
-    finish(start(tmp_path / "four", 2, devices=4))
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        address = f"localhost:{free.getsockname()[1]}"
-    two = [start(tmp_path / "two", 2, address, 2, process) for process in range(2)]
-    finish(*two)
+    chain = 2
+    finish(start(TOGETHER, tmp_path / "one", chain))
+    finish(start(TOGETHER, tmp_path / "four", chain, devices=4))
+    together(TOGETHER, tmp_path / "two", chain)
 
     one, four, two = (entries(tmp_path / name) for name in ("one", "four", "two"))
     assert len(one) == 11
