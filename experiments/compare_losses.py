@@ -37,9 +37,10 @@ CANDIDATES = {
     "l1": replace(NONE, l1=5.0),
     "nlpd": replace(NONE, nlpd=1.0),
     "l1 + ms_ssim": replace(NONE, l1=2.0, ms_ssim=1.0),
-    "l1 + nlpd + ssim": Loss(),
-    "l1 + nlpd + ssim + gmsd": replace(Loss(), gmsd=1.0),
+    "l1 + nlpd + ssim": replace(NONE, l1=1.0, nlpd=0.5, ssim=0.5),
+    "l1 + nlpd + ssim + gmsd": replace(NONE, l1=1.0, nlpd=0.5, ssim=0.5, gmsd=1.0),
     "l1 + nlpd + haarpsi": replace(NONE, l1=1.0, nlpd=0.5, haarpsi=0.5),
+    "l1 + nlpd + ssim + haarpsi": replace(NONE, l1=0.5, nlpd=0.5, ssim=0.5, haarpsi=0.5),
     "l1 + nlpd + cw_ssim": replace(NONE, l1=1.0, nlpd=0.5, cw_ssim=0.5),
     "l1 + random_features": replace(NONE, l1=2.0, random_features=0.5),
 }

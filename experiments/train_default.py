@@ -1,11 +1,13 @@
 """The run that made the built-in weights, `firenet_jax/weights/firenet.npz`.
 
-    python experiments/train_default.py RUN --images PICTURES      45 minutes on two cores
+    python experiments/train_default.py RUN --images PICTURES      2 hours on two cores
     python experiments/train_default.py RUN --report-only          what it was and how it went
 
-Two stages, each in a folder of its own under RUN; an interrupted one goes on where it was. First
-clean sensors and windows in which much moves, because there is most to learn from them; then, from
-the last weights of that, the faults of real sensors, longer sequences and slower ones.
+Stages, each in a folder of its own under RUN and from the last weights of the one before; an
+interrupted one goes on where it was. First clean sensors and windows in which much moves, because
+there is most to learn from them; then the faults of real sensors, longer sequences and slower ones;
+then windows in which next to nothing moves, as in most recordings; then a sharper loss. Each was a
+lesson of the one before.
 
 PICTURES were 63: scikit-image's own (`scenes.PHOTOGRAPHS`), matplotlib's sample data, and those
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
@@ -68,7 +70,28 @@ REAL = replace(
         cutoff=(100.0, 2000.0),
     ),
 )
-STAGES = {"clean": (CLEAN, STOP), "real": (REAL, None)}
+SPARSE = replace(
+    REAL,
+    optimiser="muon",
+    textures=1536,
+    steps=10_000,
+    motion=(0.1, 5.0),
+    learning_rate=3e-3,
+    warmup=100,
+    seed=1,
+    validate_every=250,
+)
+# From here on the loss that experiments/compare_losses.py chose.
+CHOSEN = Loss(l1=0.5, nlpd=0.5, ssim=0.5, haarpsi=0.5)
+SHARP = replace(SPARSE, warmup=50, seed=2, loss=CHOSEN)
+LAST = replace(SHARP, steps=2600, learning_rate=2e-3, warmup=30, seed=3, validate_every=200)
+STAGES = {
+    "clean": (CLEAN, STOP),
+    "real": (REAL, None),
+    "sparse": (SPARSE, 750),
+    "sharp": (SHARP, 1000),
+    "last": (LAST, None),
+}
 
 
 def train(folder: Path, images: Path) -> None:

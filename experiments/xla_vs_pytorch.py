@@ -214,8 +214,6 @@ def random_windows(width: int, height: int) -> list[Events]:
 def pipeline_makers(width: int, height: int) -> Makers:
     """Each returns the pictures (T, H, W) of a run from a zero state."""
     windows, params = random_windows(width, height), initial_params(jax.random.key(0))
-    # Random weights give dark pictures; these show the middle greys.
-    params["prediction"]["bias"] += 0.5
     size = {"height": height, "width": width}
 
     def ours(chunk):

@@ -137,3 +137,16 @@ def test_preview_shows_the_events_beside_the_reconstruction():
     assert both[0, 0, 4, 1].tolist() == [0, 0, 255]  # ON: blue
     assert both[0, 0, 5, 2].tolist() == [255, 0, 0]  # OFF: red
     assert both[0, 0, 0, 0].tolist() == [255, 255, 255]
+
+
+def test_events_become_pictures_without_a_word_from_the_host():
+    """One program: nothing in it waits for Python or copies to or from another memory."""
+    weights = Weights(initial_params(jax.random.key(0)), True)
+    packed = pack([[random_events(np.random.default_rng(t), 50, 8, 9)] for t in range(3)])
+    session = initial_session(1, 8, 9, Network())
+    size = {"height": 8, "width": 9, "settings": Display(auto_range=True)}
+    lowered = events_to_pictures.lower(weights, session, packed, np.ones((3, 1), bool), **size)
+    program = lowered.compile().as_text()
+    assert " while(" in program  # the scan; so the names below would be found too
+    for talk in ("infeed", "outfeed", " send(", " recv(", "copy-start", "callback"):
+        assert talk not in program
