@@ -64,7 +64,8 @@ def main():
         tensor = np.asarray(method(events))
         tensor = tensor[0, 0] if name == "ours" else np.moveaxis(tensor, 0, -1)
         print(f"{name:34} largest difference from numpy {np.abs(tensor - expected).max():.1e}")
-    seconds = interleaved({n: lambda m=m: m(events) for n, m in methods.items()}, options.runs)
+    runs = {name: partial(method, events) for name, method in methods.items()}
+    seconds = interleaved(runs, options.runs, rest=0.1)  # PyTorch's threads spin for a while
     rows = table(seconds, "ours")
     results = {"events": options.events, "runs": options.runs, "torch": torch.__version__}
     save("voxelisation", {**results, "rows": rows})
