@@ -31,7 +31,7 @@ from firenet_jax.scenes import HELD_OUT, load_textures, photographs
 from firenet_jax.sensor import sequences
 from firenet_jax.train import run
 
-NONE = Loss(l1=0, nlpd=0, ssim=0)
+NONE = Loss(l1=0, nlpd=0, haarpsi=0)
 # Weights that should bring each sum near the default's, so that lambda_tc means the same.
 CANDIDATES = {
     "l1": replace(NONE, l1=5.0),

@@ -46,7 +46,7 @@ CLEAN = Train(
     learning_rate=1e-3,
     optimiser="adam",
     warmup=200,
-    loss=Loss(l1=0.5, nlpd=0.5, ssim=1.0),
+    loss=Loss(l1=0.5, nlpd=0.5, ssim=1.0, haarpsi=0.0),
     scene=SceneSettings(objects=2, pause=0.1, speed=(10.0, 1000.0)),
     sensor=SensorSettings(threshold_range=(0.1, 0.5), mismatch=0.02, refractory_range=(1e-4, 1e-3)),
     validate_every=200,

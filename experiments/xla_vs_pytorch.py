@@ -70,7 +70,9 @@ IN_SCAN = 4  # windows
 IN_CHUNK = 8  # windows of the pipeline
 EVENTS_PER_PIXEL = 0.35
 REST = 0.02  # seconds: the threads of PyTorch's OpenMP spin for a few milliseconds after their work
-TRAIN = Train(output=Path("unused"), windows=10, batch=2, crop=96, loss=Loss(l0=5))
+# The losses and the optimiser that the other side has too.
+LOSS = Loss(l1=1.0, nlpd=0.5, ssim=0.5, haarpsi=0.0, l0=5)
+TRAIN = Train(output=Path("unused"), windows=10, batch=2, crop=96, loss=LOSS, optimiser="adam")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 COMPILER = shutil.which(os.environ.get("CXX", "g++"))
 

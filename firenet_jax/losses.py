@@ -6,7 +6,7 @@ Scheerlinck et al., "Fast Image Reconstruction with an Event Camera", WACV 2020:
 
 Sums over the images of a sequence, not means; the mean over the batch. L_TC is
 `metrics.temporal_error`. L_R was LPIPS, whose network has to be downloaded; here it is a weighted
-sum of distances that need nothing, by default as large as LPIPS is for a good reconstruction
+sum of distances that need nothing, by default about as large as LPIPS is for a good reconstruction
 (0.4 to 0.5), so that lambda_TC means the same.
 """
 
@@ -22,6 +22,7 @@ from firenet_jax import metrics
 class Loss:
     """The weights of Eq. 2; a term of weight 0 is not computed.
 
+    The default did best in experiments/compare_losses.py.
     gmsd, haarpsi and cw_ssim cannot tell an image from its negative: never use them alone.
     """
 
@@ -29,13 +30,13 @@ class Loss:
     """Mean absolute difference."""
     nlpd: float = 0.5
     """Normalised Laplacian pyramid distance."""
-    ssim: float = 0.5
+    ssim: float = 0.0
     """1 - SSIM."""
     ms_ssim: float = 0.0
     """1 - MS-SSIM."""
     gmsd: float = 0.0
     """Gradient magnitude similarity deviation; blind to a negative."""
-    haarpsi: float = 0.0
+    haarpsi: float = 0.5
     """1 - HaarPSI; blind to a negative."""
     cw_ssim: float = 0.0
     """1 - complex wavelet SSIM; blind to a negative."""
