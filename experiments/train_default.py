@@ -101,6 +101,13 @@ def train(folder: Path, images: Path) -> None:
         weights = folder / name / "last.npz"
 
 
+def worked(entries: list[dict]) -> float:
+    """Seconds of all runs of a stage: each that goes on where another stopped counts from zero."""
+    seconds = [entry["seconds"] for entry in entries]
+    ends = [a for a, b in zip(seconds, seconds[1:], strict=False) if b < a]
+    return sum(ends) + seconds[-1]
+
+
 def report(folder: Path) -> None:
     stages, done, seconds = {}, 0, 0.0
     figure, axes = plt.subplots(figsize=(7, 3.5), layout="constrained")
@@ -112,7 +119,7 @@ def report(folder: Path) -> None:
         stages[name] = {
             "settings": json.loads((folder / name / "settings.json").read_text()),
             "steps": validations[-1]["step"],
-            "seconds": validations[-1]["seconds"],
+            "seconds": worked(entries),
             "validations": validations,
         }
         stages[name]["settings"].pop("images")
