@@ -1,6 +1,6 @@
 """The run that made the built-in weights, `firenet_jax/weights/firenet.npz`.
 
-    python experiments/train_default.py RUN --images PICTURES      2 hours on two cores
+    python experiments/train_default.py RUN --images PICTURES      130 minutes on two cores
     python experiments/train_default.py RUN --report-only          what it was and how it went
 
 Stages, each in a folder of its own under RUN and from the last weights of the one before; an
