@@ -51,6 +51,7 @@ LINES = {
     "batch": [{"batch": batch} for batch in (1, 2, 4, 8, 16, 32)],
     "events_per_pixel": [{"events_per_pixel": 0.35 * 4.0**power} for power in range(-3, 4)],
 }
+REST = 0.3  # seconds, in which the system takes back what the case before, maybe a large one, freed
 RESOLUTIONS = [(240, 180), (346, 260), (640, 480), (1280, 720)]
 
 
@@ -91,7 +92,7 @@ def line(name: str, changes: list[dict], runs: int) -> list[dict]:
     methods = {value(name, case): pipeline(**case) for case in cases}
     rows, before = [], None
     print(f"\n{name:>18} {'ms':>10} {'min':>9} {'max':>9} {'exponent':>9} {'us / unit':>11}")
-    for place, seconds in interleaved(methods, runs).items():
+    for place, seconds in interleaved(methods, runs, REST).items():
         median = float(np.median(seconds))
         exponent = None
         if before is not None:
@@ -114,7 +115,7 @@ def real_time(sizes: list[tuple[int, int]], runs: int) -> list[dict]:
         # Few windows, so that the larger case is a small one at 1280x720 too.
         point = POINT | {"width": width, "height": height, "windows": 4}
         methods = {rate: pipeline(**point | {"events_per_pixel": rate}) for rate in rates}
-        for rate, seconds in interleaved(methods, runs).items():
+        for rate, seconds in interleaved(methods, runs, REST).items():
             per_second = 4 / float(np.median(seconds))
             mev = 1e-6 * round(rate * width * height) * per_second
             sensor = f"{width}x{height}"
