@@ -85,12 +85,32 @@ SPARSE = replace(
 CHOSEN = Loss(l1=0.5, nlpd=0.5, ssim=0.5, haarpsi=0.5)
 SHARP = replace(SPARSE, warmup=50, seed=2, loss=CHOSEN)
 LAST = replace(SHARP, steps=2600, learning_rate=2e-3, warmup=30, seed=3, validate_every=200)
+# Mostly clean sensors again: the noisy ones had been learnt at the cost of fine detail. Cameras
+# that stand still teach to forget what has passed.
+LONG = replace(
+    LAST,
+    steps=7000,
+    motion=(0.2, 5.0),
+    seed=4,
+    validate_every=500,
+    loss=Loss(l1=1.0, nlpd=0.5, ssim=1.0, haarpsi=0.5, lambda_tc=4.0),
+    scene=SceneSettings(objects=2, pause=0.2, still=0.15),
+    sensor=replace(
+        REAL.sensor,
+        mismatch=0.02,
+        noise=(1e-4, 3.0),
+        leak=(1e-4, 0.3),
+        hot=(1e-7, 1e-3),
+        cutoff=(100.0, 20_000.0),
+    ),
+)
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
     "sparse": (SPARSE, 750),
     "sharp": (SHARP, 1000),
     "last": (LAST, None),
+    "long": (LONG, None),
 }
 
 

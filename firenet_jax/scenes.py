@@ -47,6 +47,9 @@ class SceneSettings:
     """Pixels per second of the fastest point at its fastest time, drawn log-uniformly."""
     pause: float = 0.3
     """How probable it is that everything stands still for a while, in each half of the scene."""
+    still: float = 0.0
+    """How probable it is that the camera stands still all the time, where there are objects to
+    move before it."""
     zoom: tuple[float, float] = (0.45, 1.1)
     """Pixels of the image for one pixel of a texture, drawn log-uniformly for each plane. Textures
     are blurred for that scale, so small ones do not flicker; above 1 they look unsharp."""
@@ -132,13 +135,13 @@ def random_scene(
     objects = jax.vmap(_object_motion, (0, None, 0))(
         jax.random.split(object_keys, planes), side, depth
     )
-    still = jnp.arange(planes) == 0
-    objects = objects._replace(amplitude=jnp.where(still[:, None, None], 0.0, objects.amplitude))
+    ground = jnp.arange(planes) == 0
+    objects = objects._replace(amplitude=jnp.where(ground[:, None, None], 0.0, objects.amplitude))
 
     centres = uniform((-0.4, 0.4), (planes, 2)) * depth[:, None] * jnp.array([[width, height]])
-    centres = jnp.where(still[:, None], 0.0, centres)
+    centres = jnp.where(ground[:, None], 0.0, centres)
     leaning = uniform((-settings.tilt, settings.tilt), (planes, 2))
-    turned = uniform((-0.3, 0.3), (planes, 1)) * jnp.where(still, 1.0, 5.0)[:, None]
+    turned = uniform((-0.3, 0.3), (planes, 1)) * jnp.where(ground, 1.0, 5.0)[:, None]
     places = jnp.concatenate([centres, focal * depth[:, None], leaning, turned], -1)
 
     zoom = log_uniform(settings.zoom, (planes,))
@@ -181,6 +184,9 @@ def random_scene(
     )
     # The camera leads; objects move by themselves between a tenth and once as fast.
     scene = _at_pace(scene, 1.0 / side, log_uniform((0.1, 1.0), (planes,)))
+    still = (uniform((0.0, 1.0)) < settings.still) & (shown > 0)
+    pace = jnp.where(still, 0.0, scene.camera.pace)
+    scene = scene._replace(camera=scene.camera._replace(pace=pace))
     return _at_speed(scene, speed, duration, height, width)
 
 

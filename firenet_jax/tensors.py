@@ -61,8 +61,8 @@ def pack(
     """T rows of B windows -> one flat list for the device.
 
     size: padded length, at least the number of events; None: `capacity` of it.
-    bounds: (T, B, 2) int64 microseconds, t_min and t_max of each window; None: the least and the
-    greatest time of its events. Events need not be sorted.
+    bounds: (T, B, 2) int64 microseconds, t_min and t_max of each window; None: the times of its
+    first and its last event, the least and the greatest, as events are in time order.
     """
     shape = len(windows), len(windows[0])
     flat = [window for row in windows for window in row]
@@ -73,7 +73,7 @@ def pack(
     if len(flat) >= 2**15:
         raise ValueError(f"{shape} windows are too many for one chunk")
     if bounds is None:
-        bounds = np.array([(w.t.min(), w.t.max()) if len(w) else (0, 0) for w in flat], np.int64)
+        bounds = np.array([(w.t[0], w.t[-1]) if len(w) else (0, 0) for w in flat], np.int64)
     t_min, t_max = np.asarray(bounds, np.int64).reshape(-1, 2).T
 
     t, x, y, p, window = _columns(size, (np.int32, np.int16, np.int16, bool, np.int16))

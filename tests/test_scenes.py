@@ -282,6 +282,21 @@ def test_motion_is_smooth_and_pauses_stand_still(scenes):
     assert pace(scenes, np.broadcast_to(inside, (MANY, 60)))[k].max() < 1
 
 
+def test_before_a_still_camera_only_objects_move():
+    settings = SceneSettings(objects=2, speed=SPEEDS, still=1.0)
+    textures, stood = smooth_textures(), 0
+    for key in jax.random.split(jax.random.key(1), MANY):
+        scene = random_scene(key, textures, duration=DURATION, settings=settings, **SIZE)
+        objects = (np.asarray(scene.outlines).max((1, 2)) > 0).any()
+        assert (float(scene.camera.pace) == 0) == objects  # without any, the camera moves
+        if objects:
+            moved, _ = flow(scene, 0.3, 0.4, **SIZE)
+            plane = np.asarray(render(scene, 0.4, **SIZE).plane)
+            assert np.abs(np.asarray(moved)[plane == 0]).max() < 1e-4  # px, rounding
+            stood += 1
+    assert 0 < stood < MANY
+
+
 def test_other_times_do_not_retrace(scenes):
     for function, times in [(render, (0.1,)), (flow, (0.1, 0.2))]:
         compiled = []

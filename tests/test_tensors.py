@@ -46,11 +46,12 @@ def test_events_outside_the_sensor_vote_nowhere():
     assert tensor[2, 2, 4] == 1 and np.abs(tensor).sum() == 1
 
 
-def test_unsorted_times_use_the_least_and_the_greatest():
+def test_with_bounds_the_order_of_events_does_not_matter():
     rng = np.random.default_rng(2)
     events = random_events(rng, 400)
-    shuffled = events.select(rng.permutation(400))
-    np.testing.assert_allclose(tensor_of(shuffled), tensor_of(events), atol=1e-5)
+    bounds = np.array([[[events.t[0], events.t[-1]]]])
+    shuffled = tensor_of(events.select(rng.permutation(400)), bounds=bounds)
+    np.testing.assert_allclose(shuffled, tensor_of(events), atol=1e-5)
 
 
 def test_equal_times_all_vote_in_the_first_bin():
