@@ -2,11 +2,12 @@
 
 Question: how do HF, MR, E2VID and FireNet look? A row for each sequence; windows lie between
 frames, and the picture is the last after `--seconds` of events. Without recordings the sequences
-are simulated. E2VID is a named gap unless its checkpoint is given.
+are simulated. E2VID is a named gap unless its checkpoint is given. MSE and SSIM are those of the
+pictures as shown.
 
     python experiments/figure3_qualitative.py [RECORDING...] [--e2vid-weights FILE]     2 minutes
 
-Writes docs/figure3_qualitative.jpg.
+Writes docs/figure3_qualitative.jpg and results/figure3_qualitative.json.
 """
 
 from figures import (
@@ -14,6 +15,7 @@ from figures import (
     about_weights,
     arguments,
     conditions,
+    errors,
     event_picture,
     gaps,
     grid,
@@ -24,6 +26,7 @@ from figures import (
     windows_of,
     with_recordings,
 )
+from harness import save
 
 from firenet_jax.windows import Windows
 
@@ -33,12 +36,17 @@ def main():
     parser.add_argument("--equalise", choices=("none", "global", "local", "clahe"), default="none")
     options = parser.parse_args()
     methods = load_methods(["hf", "mr", "e2vid", "firenet"], options)
-    rows = []
+    rows, numbers = [], []
     for sequence in conditions(options):
         recording = sequence.recording
         windows = windows_of(sequence, Windows(between_frames=True))
         made = [last_image(method, windows, recording) for method in methods.values()]
-        shown = [picture(i, options.equalise) for i in (*made, sequence.truth(windows[-1].time))]
+        truth = sequence.truth(windows[-1].time)
+        for title, image in zip(methods, made, strict=True):
+            if truth is not None and not isinstance(image, str):
+                found = errors(image, truth, options.equalise)
+                numbers.append({"sequence": sequence.name, "method": title, **found})
+        shown = [picture(image, options.equalise) for image in (*made, truth)]
         rows.append((sequence.name, [event_picture(windows[-1], recording), *shown]))
     sheet = grid(["events", *methods, "frame"], rows, cell=200)
     caption = [
@@ -47,6 +55,7 @@ def main():
         f"sigma 25; FireNet: {about_weights(options)}.",
         *gaps(methods),
     ]
+    save("figure3_qualitative", {"notes": caption, "rows": numbers})
     save_figure(options.out / "figure3_qualitative.jpg", [sheet], " ".join(caption))
 
 
