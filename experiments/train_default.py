@@ -85,8 +85,8 @@ SPARSE = replace(
 CHOSEN = Loss(l1=0.5, nlpd=0.5, ssim=0.5, haarpsi=0.5)
 SHARP = replace(SPARSE, warmup=50, seed=2, loss=CHOSEN)
 LAST = replace(SHARP, steps=2600, learning_rate=2e-3, warmup=30, seed=3, validate_every=200)
-# Mostly clean sensors again: the noisy ones had been learnt at the cost of fine detail. A few cameras
-# stand still; with one in seven, what cannot be known there took the contrast from all images.
+# Mostly clean sensors again, because the noisy ones were learnt at the cost of fine detail. A few
+# cameras stand still; one in seven, in a trial, took contrast from all images.
 LONG = replace(
     LAST,
     steps=5800,

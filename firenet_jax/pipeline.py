@@ -2,9 +2,9 @@
 
 Recordings of one sensor size run side by side in `batch` slots, each with its own state; a slot
 whose recording has ended takes the next. The devices of a process share the slots, and processes
-the recordings. The host cuts windows and writes; everything between is
-the compiled program `reconstruction.events_to_pictures`. Memory holds a few chunks, whatever the
-length of the recordings.
+the recordings. The host cuts windows and writes; everything between is the compiled program
+`reconstruction.events_to_pictures`. Memory holds a few chunks, whatever the length of the
+recordings.
 """
 
 import dataclasses
