@@ -112,7 +112,7 @@ STAGES = {
     "sparse": (SPARSE, 750),
     "sharp": (SHARP, 1000),
     "last": (LAST, None),
-    "long": (LONG, None),
+    "long": (LONG, 5500),
 }
 
 

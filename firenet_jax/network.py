@@ -78,9 +78,11 @@ class ConvGRU(nn.Module):
         self.gates = conv(2 * self.features)
         self.candidate = conv(self.features)
 
-    def __call__(self, h: jax.Array, x: jax.Array) -> jax.Array:
+    def __call__(self, h: jax.Array, x: jax.Array, exists: jax.Array | None = None) -> jax.Array:
         gates = nn.sigmoid(self.gates(jnp.concatenate([x, h], -1)))
         r, z = jnp.split(gates, 2, -1)
+        if exists is not None:  # costs nothing here; a choice between h' and h would
+            z = z * exists[:, None, None, None]
         q = nn.tanh(self.candidate(jnp.concatenate([x, r * h], -1)))
         return (1 - z) * h + z * q
 
@@ -114,24 +116,32 @@ class FireNet(nn.Module):
         # Begins at grey: from black, the first steps of training move every bias at once.
         self.prediction = nn.Conv(1, (1, 1), bias_init=nn.initializers.constant(0.5))
 
-    def __call__(self, state: State, event_tensor: jax.Array) -> tuple[State, jax.Array]:
+    def __call__(
+        self, state: State, event_tensor: jax.Array, exists: jax.Array | None = None
+    ) -> tuple[State, jax.Array]:
         x = nn.relu(self.head(event_tensor))
-        g1 = self.gru1(state.g1, x)
+        g1 = self.gru1(state.g1, x, exists)
         x = self.res1(g1)
-        g2 = self.gru2(state.g2, x)
+        g2 = self.gru2(state.g2, x, exists)
         x = self.res2(g2)
         return State(g1, g2), self.prediction(x)[..., 0]
 
 
 def step(
-    params, state: State, event_tensor: jax.Array, *, dtype=jnp.float32
+    params,
+    state: State,
+    event_tensor: jax.Array,
+    exists: jax.Array | None = None,
+    *,
+    dtype=jnp.float32,
 ) -> tuple[State, jax.Array]:
     """One window: (State, (B, H, W, 5)) -> (State, (B, H, W)), the same function everywhere.
 
     event_tensor: normalised if the weights ask for it (`tensors.normalise`).
+    exists: (B,) bool; where False the state stays as it was and the image means nothing.
     dtype: of the convolutions; jnp.bfloat16 trades accuracy for speed on accelerators.
     """
-    return FireNet(dtype).apply({"params": params}, state, event_tensor)
+    return FireNet(dtype).apply({"params": params}, state, event_tensor, exists)
 
 
 def initial_params(key: jax.Array):

@@ -59,14 +59,8 @@ def reconstruct(
         tensors = normalise(tensors)
 
     def body(state, inputs):
-        tensor, exists = inputs
-        new, image = step(weights.params, state, tensor, dtype=dtype)
-        if not recurrent:
-            return state, image
-        if exists is not None:
-            keep = exists[:, None, None, None]
-            new = jax.tree.map(lambda new, old: jnp.where(keep, new, old), new, state)
-        return new, image
+        new, image = step(weights.params, state, *inputs, dtype=dtype)
+        return new if recurrent else state, image
 
     if not recurrent:
         state = jax.tree.map(jnp.zeros_like, state)
