@@ -1,13 +1,13 @@
 """The run that made the built-in weights, `firenet_jax/weights/firenet.npz`.
 
-    python experiments/train_default.py RUN --images PICTURES      130 minutes on two cores
+    python experiments/train_default.py RUN --images PICTURES      220 minutes on two cores
     python experiments/train_default.py RUN --report-only          what it was and how it went
 
 Stages, each in a folder of its own under RUN and from the last weights of the one before; an
 interrupted one goes on where it was. First clean sensors and windows in which much moves, because
 there is most to learn from them; then the faults of real sensors, longer sequences and slower ones;
-then windows in which next to nothing moves, as in most recordings; then a sharper loss. Each was a
-lesson of the one before.
+then windows in which next to nothing moves, as in most recordings; then a sharper loss; at last
+mostly clean sensors again. Each was a lesson of the one before.
 
 PICTURES were 63: scikit-image's own (`scenes.PHOTOGRAPHS`), matplotlib's sample data, and those
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
