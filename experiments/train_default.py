@@ -13,6 +13,8 @@ PICTURES were 63: scikit-image's own (`scenes.PHOTOGRAPHS`), matplotlib's sample
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
 Elephants) and plasma-workspace-wallpapers. No picture of `scenes.HELD_OUT` was among them.
 
+Built in is the last stage's weights.npz, the best by its validation loss.
+
 The report is written to results/train_default.json, the curve to results/train_default.png.
 """
 
@@ -86,7 +88,7 @@ CHOSEN = Loss(l1=0.5, nlpd=0.5, ssim=0.5, haarpsi=0.5)
 SHARP = replace(SPARSE, warmup=50, seed=2, loss=CHOSEN)
 LAST = replace(SHARP, steps=2600, learning_rate=2e-3, warmup=30, seed=3, validate_every=200)
 # Mostly clean sensors again, because the noisy ones were learnt at the cost of fine detail. A few
-# cameras stand still; one in seven, in a trial, took contrast from all images.
+# cameras stand still: with one in seven, and slower motion, two short trials lost contrast.
 LONG = replace(
     LAST,
     steps=5800,

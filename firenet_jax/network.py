@@ -138,7 +138,8 @@ def step(
     """One window: (State, (B, H, W, 5)) -> (State, (B, H, W)), the same function everywhere.
 
     event_tensor: normalised if the weights ask for it (`tensors.normalise`).
-    exists: (B,) bool; where False the state stays as it was and the image means nothing.
+    exists: (B,) bool; where False the state stays as it was and the image means nothing (the event
+    tensor must be finite there too: zeros, for instance).
     dtype: of the convolutions; jnp.bfloat16 trades accuracy for speed on accelerators.
     """
     return FireNet(dtype).apply({"params": params}, state, event_tensor, exists)

@@ -50,7 +50,8 @@ def reconstruct(
     """(State, (T, B, H, W, 5)) -> (State, images (T, B, H, W) float32).
 
     tensors: as `event_tensors` gives them; normalised here if the weights ask for it.
-    valid: (T, B) bool; where False the state stays as it was and the image means nothing.
+    valid: (T, B) bool; where False the state stays as it was and the image means nothing (tensors
+    must be finite there too).
     recurrent: False starts every window from a zero state (the state returned is zero).
     Raises ValueError where the shapes of state and tensors do not belong together.
     """
