@@ -40,6 +40,8 @@ class Loss:
     """1 - HaarPSI; blind to a negative."""
     cw_ssim: float = 0.0
     """1 - complex wavelet SSIM; blind to a negative."""
+    equalised: float = 0.0
+    """1 - SSIM after a soft histogram equalisation."""
     random_features: float = 0.0
     """Distance between the features of a random network."""
     lambda_tc: float = 2.0
@@ -59,6 +61,7 @@ DISTANCES = {
     "gmsd": metrics.gmsd,
     "haarpsi": lambda image, truth: 1 - metrics.haarpsi(image, truth),
     "cw_ssim": lambda image, truth: 1 - metrics.cw_ssim(image, truth),
+    "equalised": lambda image, truth: 1 - metrics.equalised_ssim(image, truth),
     "random_features": metrics.random_features,
 }
 

@@ -169,15 +169,17 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
         t_star = (BINS - 1) * since.astype(jnp.float32) / packed.duration.ravel()[window]
         seen = (0 <= x) & (x < width) & (0 <= y) & (y < height) & (window < windows)
 
-        # The triangle is not zero in two bins only, those around t*. (Vote, event) is (2, E).
-        bins = jnp.floor(t_star)[None] + jnp.array([[0.0], [1.0]])
-        votes = jnp.where(p, 1.0, -1.0)[None] * (1 - jnp.abs(bins - t_star[None]))
-        # One plane a bin, so that consecutive events, close in time, vote close in memory.
+        # The triangle is not zero in two bins only, those around t*. One plane a bin, so that
+        # consecutive events, close in time, vote close in memory; one sum after the other, as
+        # joining their lists first takes a tenth longer.
         pixel = (window * height + y) * width + x
-        place = bins.astype(jnp.int32) * (windows * plane) + pixel[None]
-        # A place past the end is dropped; a negative one would wrap round.
-        place = jnp.where(seen[None] & (0 <= bins) & (bins < BINS), place, places)
-        return planes.at[place.ravel()].add(votes.ravel(), mode="drop"), None
+        for bins in (jnp.floor(t_star), jnp.floor(t_star) + 1):
+            votes = jnp.where(p, 1.0, -1.0) * (1 - jnp.abs(bins - t_star))
+            place = bins.astype(jnp.int32) * (windows * plane) + pixel
+            # A place past the end is dropped; a negative one would wrap round.
+            place = jnp.where(seen & (0 <= bins) & (bins < BINS), place, places)
+            planes = planes.at[place].add(votes, mode="drop")
+        return planes, None
 
     # A sum over segments, block by block: what a block votes stays in a CPU's cache, which is a
     # fifth faster for a million events. Accelerators take the list as one block.

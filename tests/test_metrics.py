@@ -17,6 +17,7 @@ SIMILARITIES = {
     "ms_ssim": (metrics.ms_ssim, references.ms_ssim),
     "haarpsi": (metrics.haarpsi, references.haarpsi),
     "cw_ssim": (metrics.cw_ssim, references.cw_ssim),
+    "equalised_ssim": (metrics.equalised_ssim, references.equalised_ssim),
 }
 DISTANCES = {
     "mse": (metrics.mse, mean_squared_error),
@@ -149,6 +150,16 @@ def test_gmsd_is_blind_to_any_offset_and_nlpd_is_not():
     assert (metrics.nlpd(truth + 0.3, truth) > 0.05).all()
     dark, bright = (np.full((H, W), value, np.float32) for value in (0.2, 0.7))
     assert metrics.nlpd(dark, bright) > 0.05
+
+
+def test_equalised_ssim_ignores_tone_and_sees_faint_texture():
+    _, truth = cases()
+    toned = 0.1 + 0.8 * truth**0.7
+    lost, kept = (1 - function(toned, truth) for function in (metrics.ssim, metrics.equalised_ssim))
+    assert (kept < 0.35 * lost).all()
+    faint, flat = 0.5 + 0.05 * (truth - 0.5), np.full_like(truth, 0.5)
+    assert (metrics.ssim(flat, faint) > 0.9).all()  # its constants hide what is lost
+    assert (metrics.equalised_ssim(flat, faint) < 0.6).all()
 
 
 def extremes():
