@@ -42,6 +42,7 @@ from firenet_jax.video import (
     check_output,
     open_writer,
     partial_name,
+    writing,
 )
 from firenet_jax.windows import Window, Windows, cut
 
@@ -134,6 +135,7 @@ class Running:
     windows: Iterator[Window]
     ahead: Window | None  # the next window; None after the last
     done: int  # pictures of an earlier run, already on disk
+    reached: int  # windows taken so far, those of the earlier run among them
     writer: FolderWriter | VideoWriter | None = None  # opened with the first picture
 
     def take(self, count: int) -> list[Window]:
@@ -142,6 +144,7 @@ class Running:
         while self.ahead is not None and len(taken) < count:
             taken.append(self.ahead)
             self.ahead = next(self.windows, None)
+        self.reached += len(taken)
         return taken
 
 
@@ -150,6 +153,7 @@ class Part(NamedTuple):
 
     running: Running
     times: list[int]  # of its windows, microseconds
+    reached: int  # windows of the recording up to the last of these
     ends: bool  # no windows follow
 
 
@@ -235,7 +239,7 @@ def reconstruct_jobs(
     chunks = ahead(in_chunks(jobs, settings, slots, count), depth=1)
 
     def device():
-        """Chunk by chunk: (chunk, pictures on the host, states to keep for resuming, by slot).
+        """Chunk by chunk: (chunk, pictures on the host).
 
         An accelerator has the next chunk before the last one's pictures are fetched, so that it
         never waits. A CPU has not: it would gain nothing, and each chunk in flight holds memory.
@@ -258,7 +262,11 @@ def reconstruct_jobs(
             )  # fmt: skip
             states = {}
             if time.monotonic() - saved > RESUME_EVERY:
-                states = {slot: _get_slot(session, slot) for slot in chunk.parts}
+                states = {
+                    slot: _get_slot(session, slot)
+                    for slot, part in chunk.parts.items()
+                    if part.running.job.output.suffix not in VIDEOS and not part.ends
+                }
                 saved = time.monotonic()
             sent.append((chunk, shown, states))
             if len(sent) == in_flight:
@@ -266,17 +274,20 @@ def reconstruct_jobs(
         yield from (fetch(*entry) for entry in sent)
 
     def fetch(chunk, shown, states):
-        return chunk, *jax.device_get((shown, states))
+        # A state goes to disk from here, not with the pictures, so that none waits in memory.
+        for slot, state in jax.device_get(states).items():
+            keep_position(chunk.parts[slot], state)
+        return chunk, jax.device_get(shown)
 
     pictures_done = events_done = 0
-    writing: dict[int, Running] = {}
+    open_jobs: dict[int, Running] = {}
     finished = ahead(device(), depth=1)
     try:
-        for chunk, shown, states in finished:
-            for slot, (running, times, ends) in chunk.parts.items():
+        for chunk, shown in finished:
+            for slot, (running, times, reached, ends) in chunk.parts.items():
                 if running.writer is None:
                     running.writer = open_writer(running.job.output, settings.fps, running.done)
-                    writing[slot] = running
+                    open_jobs[slot] = running
                 for picture, time_of in zip(shown[:, slot], times, strict=False):
                     running.writer.write(picture, time_of)
                 pictures_done += len(times)
@@ -284,15 +295,15 @@ def reconstruct_jobs(
                     if isinstance(running.writer, FolderWriter):
                         position_file(running.job).unlink(missing_ok=True)
                     running.writer.finish()
-                    del writing[slot]
-                elif slot in states and isinstance(running.writer, FolderWriter):
-                    save_position(running, states[slot])
+                    del open_jobs[slot]
+                else:
+                    publish_position(running, reached)
             events_done += chunk.count
             progress.update(chunk.count)
             progress.set_postfix_str(f"{pictures_done} pictures", refresh=False)
     finally:
         finished.close()
-        for running in writing.values():
+        for running in open_jobs.values():
             running.writer.abandon()
     return pictures_done, events_done
 
@@ -329,7 +340,8 @@ def in_chunks(jobs: list[Job], settings: Reconstruct, slots: int, devices: int) 
             for t, window in enumerate(windows):
                 rows[t][slot] = window.events
             valid[: len(windows), slot] = True
-            parts[slot] = Part(job, [window.time for window in windows], job.ahead is None)
+            times = [window.time for window in windows]
+            parts[slot] = Part(job, times, job.reached, job.ahead is None)
             if job.ahead is None:
                 del running[slot]
         count = sum(len(events) for row in rows for events in row)
@@ -353,7 +365,7 @@ def start(job: Job, settings: Reconstruct) -> tuple[Running, Session]:
     first = next(itertools.islice(windows, done, None), None)
     if first is None and not done:
         raise RecordingError(f"{recording.path}: no events, or none that the filters let pass")
-    return Running(job, windows, first, done), session
+    return Running(job, windows, first, done, done), session
 
 
 def hot_pixels(choice: str, recording: Recording) -> np.ndarray:
@@ -388,14 +400,26 @@ def position_file(job: Job) -> Path:
     return partial_name(job.output) / "resume.npz"
 
 
-def save_position(running: Running, session: Session) -> None:
-    """Keeps beside the partial output what is needed to go on from here."""
-    running.writer.flush()
-    path = position_file(running.job)
-    beside = path.with_suffix(".new.npz")
+def kept_file(job: Job, reached: int) -> Path:
+    return position_file(job).with_suffix(f".{reached}.npz")
+
+
+def keep_position(part: Part, session: Session) -> None:
+    """What is needed to go on after the part's last picture, which may not be on disk yet."""
+    job = part.running.job
     leaves = {f"state{i}": leaf for i, leaf in enumerate(jax.tree.leaves(session))}
-    np.savez(beside, record=running.job.record, pictures=running.writer.count, **leaves)
-    os.replace(beside, path)
+    with writing(job.output):
+        path = kept_file(job, part.reached)
+        path.parent.mkdir(exist_ok=True)
+        np.savez(path, record=job.record, pictures=part.reached, **leaves)
+
+
+def publish_position(running: Running, reached: int) -> None:
+    """All pictures up to `reached` are written: from now on a new run goes on there."""
+    path = kept_file(running.job, reached)
+    if path.exists():
+        running.writer.flush()
+        os.replace(path, position_file(running.job))
 
 
 def load_position(job: Job, settings: Reconstruct) -> tuple[int, Session]:
@@ -405,6 +429,8 @@ def load_position(job: Job, settings: Reconstruct) -> tuple[int, Session]:
     initial = initial_session(1, height, width, settings.network)
     initial = jax.tree.map(lambda leaf: leaf[0], initial)
     path = position_file(job)
+    for ahead_of_pictures in path.parent.glob("resume.*.npz"):
+        ahead_of_pictures.unlink()
     if job.output.suffix in VIDEOS or not path.exists():
         return 0, initial
     try:

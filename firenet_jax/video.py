@@ -56,7 +56,7 @@ def check_output(path: Path, overwrite: bool) -> None:
 
 
 @contextlib.contextmanager
-def _writing(path: Path):
+def writing(path: Path):
     """Full disks and the like, said with the name of the output."""
     try:
         yield
@@ -77,7 +77,7 @@ class FolderWriter:
         """done: pictures of an earlier run to keep; what lies beyond them is written again."""
         self.path, self.partial = path, partial_name(path)
         self.count = done
-        with _writing(path):
+        with writing(path):
             self.partial.mkdir(exist_ok=True)
             stamps = self.partial / "timestamps.txt"
             kept = stamps.read_text().splitlines()[:done] if done else []
@@ -86,17 +86,17 @@ class FolderWriter:
 
     def write(self, picture: np.ndarray, time: int) -> None:
         name = self.partial / f"frame_{self.count:010d}.png"
-        with _writing(self.path):
+        with writing(self.path):
             Image.fromarray(picture).save(name, compress_level=PNG_LEVEL)
             self.stamps.write(f"{time // 1_000_000}.{time % 1_000_000:06d}\n")
         self.count += 1
 
     def flush(self) -> None:
-        with _writing(self.path):
+        with writing(self.path):
             self.stamps.flush()
 
     def finish(self) -> None:
-        with _writing(self.path):
+        with writing(self.path):
             self.stamps.close()
         for extra in self.partial.glob("frame_*.png"):  # of a longer run before this one
             if int(extra.stem.removeprefix("frame_")) >= self.count:
@@ -122,7 +122,7 @@ class VideoWriter:
         self.path, self.partial = path, partial_name(path)
         self.rate = Fraction(fps).limit_denominator(1000)
         self.count = 0
-        with _writing(path):
+        with writing(path):
             self.container = av.open(str(self.partial), "w")
         self.stream = self.filter = None
 
@@ -153,11 +153,11 @@ class VideoWriter:
         if self.filter:
             self.filter.vpush(frame)
             frame = self.filter.vpull()
-        with _writing(self.path):
+        with writing(self.path):
             self.container.mux(self.stream.encode(frame))
 
     def finish(self) -> None:
-        with _writing(self.path):
+        with writing(self.path):
             if self.stream is not None:
                 self.container.mux(self.stream.encode(None))
             self.container.close()
