@@ -6,8 +6,9 @@
 Stages, each in a folder of its own under RUN and from the last weights of the one before; an
 interrupted one goes on where it was. First clean sensors and windows in which much moves, because
 there is most to learn from them; then the faults of real sensors, longer sequences and slower ones;
-then windows in which next to nothing moves, as in most recordings; then a sharper loss; at last
-mostly clean sensors again. Each was a lesson of the one before.
+then windows in which next to nothing moves, as in most recordings; then a sharper loss; then
+mostly clean sensors again; at last a loss that sees faint structure and flicker. Each was a lesson
+of the one before.
 
 PICTURES were 63: scikit-image's own (`scenes.PHOTOGRAPHS`), matplotlib's sample data, and those
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
@@ -108,6 +109,17 @@ LONG = replace(
         cutoff=(100.0, 20_000.0),
     ),
 )
+# Structure wherever it is, faint or strong, and less flicker. It ran as two processes, each with a
+# core and half of the batch (`coordinator`, `processes`, `process` of `Train`).
+EVEN = replace(
+    LONG,
+    batch=4,
+    steps=3400,
+    warmup=30,
+    seed=5,
+    validate_every=400,
+    loss=Loss(l1=0.5, nlpd=0.5, ssim=0.7, haarpsi=0.5, equalised=0.7, lambda_tc=9.0),
+)
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
@@ -115,6 +127,7 @@ STAGES = {
     "sharp": (SHARP, 1000),
     "last": (LAST, None),
     "long": (LONG, 5500),
+    "even": (EVEN, None),
 }
 
 

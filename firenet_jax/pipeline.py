@@ -136,6 +136,7 @@ class Running:
     ahead: Window | None  # the next window; None after the last
     done: int  # pictures of an earlier run, already on disk
     reached: int  # windows taken so far, those of the earlier run among them
+    error: RecordingError | None = None  # that ended its windows before their time
     writer: FolderWriter | VideoWriter | None = None  # opened with the first picture
 
     def take(self, count: int) -> list[Window]:
@@ -143,7 +144,10 @@ class Running:
         taken = []
         while self.ahead is not None and len(taken) < count:
             taken.append(self.ahead)
-            self.ahead = next(self.windows, None)
+            try:
+                self.ahead = next(self.windows, None)
+            except RecordingError as error:
+                self.ahead, self.error = None, error
         self.reached += len(taken)
         return taken
 
@@ -189,17 +193,24 @@ def run(settings: Reconstruct) -> list[Path]:
     counts = [recording.count for recording in recordings]
     partly = settings.start or settings.stop or settings.windows.step
     known = None if None in counts or partly else sum(counts)
-    began = time.monotonic()
+    began, failed = time.monotonic(), {}
     with tqdm(total=known, unit="ev", unit_scale=True, smoothing=0.1, disable=None) as progress:
         total = [
-            reconstruct_jobs(same, settings, weights, progress) for same in by_sensor_size(jobs)
+            reconstruct_jobs(same, settings, weights, progress, failed)
+            for same in by_sensor_size(jobs)
         ]
     seconds = time.monotonic() - began
     shown, events = (sum(column) for column in zip(*total, strict=True))
-    print(
-        f"{', '.join(map(str, outputs))}: {shown} pictures of {events:,} events in {seconds:.1f} s "
-        f"({shown / seconds:.1f} pictures/s, {events / seconds / 1e6:.2f} Mev/s)"
-    )
+    done = [output for output in outputs if output not in failed]
+    if done:
+        rates = f"{shown / seconds:.1f} pictures/s, {events / seconds / 1e6:.2f} Mev/s"
+        print(
+            f"{', '.join(map(str, done))}: {shown} pictures of {events:,} events in "
+            f"{seconds:.1f} s ({rates})"
+        )
+    if failed:
+        rest = "; the other recordings are done" if done else ""
+        raise RecordingError("; ".join(map(str, failed.values())) + rest)
     return outputs
 
 
@@ -227,16 +238,24 @@ def by_sensor_size(jobs: list[Job]) -> list[list[Job]]:
 
 
 def reconstruct_jobs(
-    jobs: list[Job], settings: Reconstruct, weights: Weights, progress: tqdm
+    jobs: list[Job],
+    settings: Reconstruct,
+    weights: Weights,
+    progress: tqdm,
+    failed: dict[Path, RecordingError],
 ) -> tuple[int, int]:
-    """Jobs of one sensor size -> their outputs on disk; returns (pictures, events) done."""
+    """Jobs of one sensor size -> their outputs on disk; returns (pictures, events) done.
+
+    A recording that turns out to be damaged does not keep the others from being done: its error
+    goes to `failed`, by its output.
+    """
     height, width = jobs[0].recording.height, jobs[0].recording.width
     wanted = min(settings.batch or jax.local_device_count(), len(jobs))
     count = min(wanted, jax.local_device_count())
     mesh = in_a_row(jax.local_devices()[:count]) if count > 1 else None
     slots = -(-wanted // count) * count  # the same number on each device; some may stay empty
     weights = jax.device_put(weights, shared(EVERYWHERE, mesh) if mesh else None)
-    chunks = ahead(in_chunks(jobs, settings, slots, count), depth=1)
+    chunks = ahead(in_chunks(jobs, settings, slots, count, failed), depth=1)
 
     def device():
         """Chunk by chunk: (chunk, pictures on the host).
@@ -291,7 +310,10 @@ def reconstruct_jobs(
                 for picture, time_of in zip(shown[:, slot], times, strict=False):
                     running.writer.write(picture, time_of)
                 pictures_done += len(times)
-                if ends:
+                if ends and running.error:
+                    failed[running.job.output] = running.error
+                    open_jobs.pop(slot).writer.abandon()
+                elif ends:
                     if isinstance(running.writer, FolderWriter):
                         position_file(running.job).unlink(missing_ok=True)
                     running.writer.finish()
@@ -318,7 +340,13 @@ def _get_slot(session: Session, slot) -> Session:
     return jax.tree.map(lambda all: all[slot], session)
 
 
-def in_chunks(jobs: list[Job], settings: Reconstruct, slots: int, devices: int) -> Iterator[Chunk]:
+def in_chunks(
+    jobs: list[Job],
+    settings: Reconstruct,
+    slots: int,
+    devices: int,
+    failed: dict[Path, RecordingError],
+) -> Iterator[Chunk]:
     """Jobs -> chunks of T x B windows, B the slots; a free slot takes the next job."""
     steps = settings.chunk or (4 if jax.default_backend() == "cpu" else 16)
     waiting = iter(jobs)
@@ -327,9 +355,11 @@ def in_chunks(jobs: list[Job], settings: Reconstruct, slots: int, devices: int) 
     while True:
         starts = {}
         for slot in range(slots):
-            job = None if slot in running else next(waiting, None)
-            if job is not None:
-                running[slot], starts[slot] = start(job, settings)
+            while slot not in running and (job := next(waiting, None)) is not None:
+                try:
+                    running[slot], starts[slot] = start(job, settings)
+                except RecordingError as error:
+                    failed[job.output] = error
         if not running:
             return
         rows = [[Events.empty()] * slots for _ in range(steps)]

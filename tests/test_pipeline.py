@@ -11,6 +11,7 @@ from processes import finish, start, together
 
 from firenet_jax import pipeline
 from firenet_jax.checkpoint import save_weights
+from firenet_jax.events import RecordingError
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pictures import Display
 from firenet_jax.pipeline import Reconstruct, run
@@ -220,6 +221,35 @@ def run_flipped(tmp_path, weights, recording, choices):
     assert first == 0  # or the time span would begin elsewhere
     run(settings(weights, (path,), tmp_path / "turned", **choices))
     return pictures_of(tmp_path / "turned")[0]
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+def test_a_damaged_recording_does_not_keep_others_from_being_done(
+    tmp_path, weights, batch, monkeypatch
+):
+    """One is damaged at its beginning, one after five windows."""
+    names = "early", "good", "late", "fine"
+    paths = [write_recording(tmp_path / f"{name}.txt", 900, seed=3) for name in names]
+    (tmp_path / "early.txt").write_text(f"{WIDTH} {HEIGHT}\n0.5 1 1 1 1\n")
+    whole = pipeline.cut
+
+    def cut(recording, *args):
+        for number, window in enumerate(whole(recording, *args)):
+            if recording.path.stem == "late" and number == 5:
+                raise RecordingError(f"{recording.path}: damaged")
+            yield window
+
+    monkeypatch.setattr(pipeline, "cut", cut)
+    with pytest.raises(RecordingError) as raised:
+        run(settings(weights, tuple(paths), tmp_path / "all", batch=batch))
+    said = str(raised.value)
+    assert "early.txt" in said and "late.txt" in said and "the other recordings are done" in said
+    run(settings(weights, (tmp_path / "good.txt",), tmp_path / "alone"))
+    expected, _ = pictures_of(tmp_path / "alone")
+    for name in ("good", "fine"):
+        np.testing.assert_array_equal(pictures_of(tmp_path / "all" / name)[0], expected)
+    left = {path.name for path in (tmp_path / "all").iterdir()}
+    assert left == {"good", "fine", "late.partial"}
 
 
 def test_no_events_is_an_error(tmp_path, weights):
