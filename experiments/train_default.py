@@ -1,6 +1,6 @@
 """The run that made the built-in weights, `firenet_jax/weights/firenet.npz`.
 
-    python experiments/train_default.py RUN --images PICTURES      220 minutes on two cores
+    python experiments/train_default.py RUN --images PICTURES      5 hours on two cores
     python experiments/train_default.py RUN --report-only          what it was and how it went
 
 Stages, each in a folder of its own under RUN and from the last weights of the one before; an
@@ -127,7 +127,7 @@ STAGES = {
     "sharp": (SHARP, 1000),
     "last": (LAST, None),
     "long": (LONG, 5500),
-    "even": (EVEN, None),
+    "even": (EVEN, 3200),
 }
 
 
