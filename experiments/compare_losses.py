@@ -94,6 +94,7 @@ def main():
         crop=64,
         chain=2,
         warmup=50,
+        optimiser="muon",
         learning_rate=3e-3,
         validate_every=options.steps,
     )
