@@ -197,8 +197,8 @@ def equalised_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
 
     A pixel becomes the part of the image that is darker than it, the mean over 6x6 evenly spaced
     pixels q of sigmoid((I - I_q) / 0.03): any brightening that keeps the order hardly matters, and
-    faint texture weighs as much as strong. It is what papers measure when they equalise images
-    (`equalise`) before SSIM, with a gradient and without surroundings.
+    texture down to a contrast of about 0.03 weighs as much as strong one. It is what papers measure
+    when they equalise images (`equalise`) before SSIM, with a gradient and without surroundings.
     """
     return ssim(*(_equalised(picture) for picture in _compared(image, truth)))
 

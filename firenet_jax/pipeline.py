@@ -303,23 +303,24 @@ def reconstruct_jobs(
     finished = ahead(device(), depth=1)
     try:
         for chunk, shown in finished:
-            for slot, (running, times, reached, ends) in chunk.parts.items():
+            for slot, part in chunk.parts.items():
+                running, times = part.running, part.times
                 if running.writer is None:
                     running.writer = open_writer(running.job.output, settings.fps, running.done)
                     open_jobs[slot] = running
                 for picture, time_of in zip(shown[:, slot], times, strict=False):
                     running.writer.write(picture, time_of)
                 pictures_done += len(times)
-                if ends and running.error:
+                if part.ends and running.error:
                     failed[running.job.output] = running.error
                     open_jobs.pop(slot).writer.abandon()
-                elif ends:
+                elif part.ends:
                     if isinstance(running.writer, FolderWriter):
                         position_file(running.job).unlink(missing_ok=True)
                     running.writer.finish()
                     del open_jobs[slot]
                 else:
-                    publish_position(running, reached)
+                    publish_position(part)
             events_done += chunk.count
             progress.update(chunk.count)
             progress.set_postfix_str(f"{pictures_done} pictures", refresh=False)
@@ -430,8 +431,8 @@ def position_file(job: Job) -> Path:
     return partial_name(job.output) / "resume.npz"
 
 
-def kept_file(job: Job, reached: int) -> Path:
-    return position_file(job).with_suffix(f".{reached}.npz")
+def kept_file(part: Part) -> Path:
+    return position_file(part.running.job).with_suffix(f".{part.reached}.npz")
 
 
 def keep_position(part: Part, session: Session) -> None:
@@ -439,17 +440,17 @@ def keep_position(part: Part, session: Session) -> None:
     job = part.running.job
     leaves = {f"state{i}": leaf for i, leaf in enumerate(jax.tree.leaves(session))}
     with writing(job.output):
-        path = kept_file(job, part.reached)
+        path = kept_file(part)
         path.parent.mkdir(exist_ok=True)
         np.savez(path, record=job.record, pictures=part.reached, **leaves)
 
 
-def publish_position(running: Running, reached: int) -> None:
-    """All pictures up to `reached` are written: from now on a new run goes on there."""
-    path = kept_file(running.job, reached)
+def publish_position(part: Part) -> None:
+    """The part's pictures are written: if its state was kept, a new run goes on from there."""
+    path = kept_file(part)
     if path.exists():
-        running.writer.flush()
-        os.replace(path, position_file(running.job))
+        part.running.writer.flush()
+        os.replace(path, position_file(part.running.job))
 
 
 def load_position(job: Job, settings: Reconstruct) -> tuple[int, Session]:
@@ -459,8 +460,8 @@ def load_position(job: Job, settings: Reconstruct) -> tuple[int, Session]:
     initial = initial_session(1, height, width, settings.network)
     initial = jax.tree.map(lambda leaf: leaf[0], initial)
     path = position_file(job)
-    for ahead_of_pictures in path.parent.glob("resume.*.npz"):
-        ahead_of_pictures.unlink()
+    for unpublished in path.parent.glob("resume.*.npz"):
+        unpublished.unlink()
     if job.output.suffix in VIDEOS or not path.exists():
         return 0, initial
     try:
