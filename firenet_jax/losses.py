@@ -42,6 +42,8 @@ class Loss:
     """1 - complex wavelet SSIM; blind to a negative."""
     equalised: float = 0.0
     """1 - SSIM after a soft histogram equalisation."""
+    equalised_mse: float = 0.0
+    """Mean squared difference after a soft histogram equalisation."""
     random_features: float = 0.0
     """Distance between the features of a random network."""
     lambda_tc: float = 2.0
@@ -62,6 +64,7 @@ DISTANCES = {
     "haarpsi": lambda image, truth: 1 - metrics.haarpsi(image, truth),
     "cw_ssim": lambda image, truth: 1 - metrics.cw_ssim(image, truth),
     "equalised": lambda image, truth: 1 - metrics.equalised_ssim(image, truth),
+    "equalised_mse": metrics.equalised_mse,
     "random_features": metrics.random_features,
 }
 

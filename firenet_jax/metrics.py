@@ -203,6 +203,12 @@ def equalised_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     return ssim(*(_equalised(picture) for picture in _compared(image, truth)))
 
 
+@jax.jit
+def equalised_mse(image: jax.Array, truth: jax.Array) -> jax.Array:
+    """Mean squared difference after the soft histogram equalisation of `equalised_ssim`."""
+    return mse(*(_equalised(picture) for picture in _compared(image, truth)))
+
+
 def _equalised(image: jax.Array) -> jax.Array:
     rows, columns = (
         ((np.arange(RANKED) + 0.5) * side / RANKED).astype(int) for side in image.shape[-2:]

@@ -50,6 +50,9 @@ class SceneSettings:
     still: float = 0.0
     """How probable it is that the camera stands still all the time, where there are objects to
     move before it."""
+    plain: float = 0.0
+    """How probable it is that the background is one grey, where there are objects before it: what
+    passes such a background must leave no trail."""
     zoom: tuple[float, float] = (0.45, 1.1)
     """Pixels of the image for one pixel of a texture, drawn log-uniformly for each plane. Textures
     are blurred for that scale, so small ones do not flicker; above 1 they look unsharp."""
@@ -167,6 +170,10 @@ def random_scene(
     length = duration * uniform((0.02, 0.5 - 0.3 - 0.02), (PAUSES,))
     length = jnp.where(uniform((0.0, 1.0), (PAUSES,)) < settings.pause, length, 0.0)
     pauses = jnp.stack([start, start + length, jnp.broadcast_to(ramp, (PAUSES,))], -1)
+
+    if settings.plain:
+        plain = (uniform((0.0, 1.0)) < settings.plain) & (shown > 0)
+        canvases = canvases.at[0].set(jnp.where(plain, uniform((0.2, 0.8)), canvases[0]))
 
     scene = Scene(
         focal=focal,

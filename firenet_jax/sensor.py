@@ -358,8 +358,8 @@ def simulate(
 
     bounds: (T + 1, B) int32, microseconds since the scenes' start; window t lasts from t to t + 1.
     state: what the last call returned, to go on where it ended; None starts afresh.
-    renderings: so many in each window, equally spaced. Nothing moves by more than half a pixel
-    from one to the next where windows last at most renderings / 2 / scene.speed seconds.
+    renderings: so many in each window, equally spaced. Nothing moves by more than a pixel from one
+    to the next where windows last at most renderings / scene.speed seconds.
     """
     draw = partial(_draw, height=height, width=width)
     move = jax.vmap(partial(flow, height=height, width=width))
@@ -457,11 +457,12 @@ def random_setups(
 
     The windows of a sequence all last equally long: so that at its fastest time the fastest point
     moves by so many pixels as `motion` says (least, greatest; log-uniform), but 1 to 300 ms.
-    Raises ValueError where that is more than half a pixel from one rendering to the next.
+    Raises ValueError where that is more than a pixel from one rendering to the next, the most that
+    keeps events true (Gehrig et al., "Video to Events", CVPR 2020).
     """
-    if motion[1] > 0.5 * renderings:
+    if motion[1] > renderings:
         raise ValueError(
-            f"windows with {motion[1]} pixels of motion need {math.ceil(2 * motion[1])} "
+            f"windows with {motion[1]} pixels of motion need {math.ceil(motion[1])} "
             f"renderings, not {renderings}"
         )
     scene_key, sensor_key, number_key = jax.random.split(key, 3)
@@ -474,7 +475,7 @@ def random_setups(
     speed = log_uniform(scene.speed, numbers[0])
     duration = 1e6 * log_uniform(motion, numbers[1]) / speed
     duration = jnp.clip(duration, 1e3, 3e5).astype(jnp.int32)
-    speed = jnp.minimum(speed, 1e6 * 0.5 * renderings / duration)
+    speed = jnp.minimum(speed, 1e6 * renderings / duration)
     size = {"height": height, "width": width}
 
     def one_scene(key, duration, speed):

@@ -111,7 +111,7 @@ class Train:
     renderings: int = 5
     """Renderings in a window."""
     motion: tuple[float, float] = (1.25, 2.5)
-    """Pixels by which the fastest point moves in a window, at most half of the renderings; drawn
+    """Pixels by which the fastest point moves in a window, at most one for a rendering; drawn
     log-uniformly for a sequence."""
     learning_rate: float = 1e-3
     """Greatest rate, after warming up; it then falls to a hundredth along a cosine."""
@@ -581,4 +581,6 @@ def _same_settings(folder: Path, settings: Train) -> None:
     if path.exists() and path.read_text() != text:
         raise ValueError(f"{folder} holds a run with other settings: choose another --output")
     if _first():
-        path.write_text(text)
+        whole = path.with_suffix(".part")  # other processes may be looking
+        whole.write_text(text)
+        whole.replace(path)

@@ -20,17 +20,22 @@ def ssim(image, truth, **kwargs):
     )
 
 
-def equalised_ssim(image, truth):
-    def equalised(picture):
-        height, width = picture.shape
-        result = np.zeros_like(picture)
-        for i in range(6):
-            for j in range(6):
-                other = picture[(2 * i + 1) * height // 12, (2 * j + 1) * width // 12]
-                result += 1 / (1 + np.exp((other - picture) / 0.03)) / 36
-        return result
+def equalised(picture):
+    height, width = picture.shape
+    result = np.zeros(picture.shape)
+    for i in range(6):
+        for j in range(6):
+            other = picture[(2 * i + 1) * height // 12, (2 * j + 1) * width // 12]
+            result += 1 / (1 + np.exp((other - picture) / 0.03)) / 36
+    return result
 
+
+def equalised_ssim(image, truth):
     return ssim(equalised(image), equalised(truth))
+
+
+def equalised_mse(image, truth):
+    return np.mean((equalised(image) - equalised(truth)) ** 2)
 
 
 def halved(image):

@@ -112,7 +112,7 @@ def test_a_perfect_reconstruction_of_a_moving_picture_costs_nothing():
     )
 
 
-SIGHTED = ("l1", "nlpd", "ssim", "ms_ssim", "equalised", "random_features")
+SIGHTED = ("l1", "nlpd", "ssim", "ms_ssim", "equalised", "equalised_mse", "random_features")
 
 
 @pytest.mark.parametrize("names", [("l1", "nlpd", "haarpsi"), *((name,) for name in SIGHTED)])

@@ -24,6 +24,7 @@ DISTANCES = {
     "l1": (metrics.l1, lambda image, truth: np.abs(image - truth).mean()),
     "nlpd": (metrics.nlpd, references.nlpd),
     "gmsd": (metrics.gmsd, references.gmsd),
+    "equalised_mse": (metrics.equalised_mse, references.equalised_mse),
     "random_features": (
         metrics.random_features,
         partial(references.random_features, metrics.random_kernels(0)),

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, minimum_filter
 
 from firenet_jax import scenes as module
 from firenet_jax.scenes import (
@@ -295,6 +295,19 @@ def test_before_a_still_camera_only_objects_move():
             assert np.abs(np.asarray(moved)[plane == 0]).max() < 1e-4  # px, rounding
             stood += 1
     assert 0 < stood < MANY
+
+
+def test_a_plain_background_shows_nothing_but_objects():
+    settings = SceneSettings(objects=2, speed=SPEEDS, plain=1.0)
+    textures, plain = smooth_textures(), 0
+    for key in jax.random.split(jax.random.key(1), MANY):
+        scene = random_scene(key, textures, duration=DURATION, settings=settings, **SIZE)
+        image, plane = map(np.asarray, render(scene, 0.4, **SIZE))
+        objects = (np.asarray(scene.outlines).max((1, 2)) > 0).any()
+        ground = minimum_filter(plane == 0, 9)  # without soft edges
+        assert (np.ptp(image[ground]) < 1e-6) == objects  # without any, it keeps its texture
+        plain += objects
+    assert 0 < plain < MANY
 
 
 def test_other_times_do_not_retrace(scenes):

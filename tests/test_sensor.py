@@ -459,7 +459,7 @@ def test_random_sequences_have_the_declared_shapes_and_do_not_retrace(textures):
         assert np.isfinite(leaf).all()
     assert made.images.min() >= 0 and made.images.max() <= 1
     with pytest.raises(ValueError, match="6 renderings"):
-        sequences(jax.random.key(0), textures, **(SETTINGS | dict(motion=(1.0, 3.0))))
+        sequences(jax.random.key(0), textures, **(SETTINGS | dict(motion=(1.0, 6.0))))
 
 
 @pytest.mark.slow

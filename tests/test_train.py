@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -141,6 +142,21 @@ def test_other_settings_do_not_continue_a_run(tmp_path):
     train._same_settings(tmp_path, tiny(tmp_path))
     with pytest.raises(ValueError, match="other settings"):
         train._same_settings(tmp_path, tiny(tmp_path, seed=1))
+
+
+def test_another_process_never_sees_half_of_the_settings(tmp_path, monkeypatch):
+    settings, write = Train(output=tmp_path), Path.write_text
+
+    def write_with_a_look_in_between(path, text):
+        write(path, text[:10])
+        with monkeypatch.context() as other:
+            other.setattr(train, "_first", lambda: False)
+            train._same_settings(tmp_path, settings)
+        write(path, text)
+
+    monkeypatch.setattr(Path, "write_text", write_with_a_look_in_between)
+    train._same_settings(tmp_path, settings)
+    assert [path.name for path in tmp_path.iterdir()] == ["settings.json"]
 
 
 def test_weights_that_expect_other_tensors_are_refused(tmp_path):
