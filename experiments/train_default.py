@@ -7,8 +7,9 @@ Stages, each in a folder of its own under RUN and from the last weights of the o
 interrupted one goes on where it was. First clean sensors and windows in which much moves, because
 there is most to learn from them; then the faults of real sensors, longer sequences and slower ones;
 then windows in which next to nothing moves, as in most recordings; then a sharper loss; then
-mostly clean sensors again; at last a loss that sees faint structure and flicker. Each was a lesson
-of the one before.
+mostly clean sensors again; then a loss that sees faint structure and flicker; at last objects before
+blank grounds and uneven thresholds, so that it forgets what has passed. Each was a lesson of the
+one before.
 
 PICTURES were 63: scikit-image's own (`scenes.PHOTOGRAPHS`), matplotlib's sample data, and those
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
@@ -120,6 +121,22 @@ EVEN = replace(
     validate_every=400,
     loss=Loss(l1=0.5, nlpd=0.5, ssim=0.7, haarpsi=0.5, equalised=0.7, lambda_tc=9.0),
 )
+# Objects before nothing at all, because what passed a blank ground left a trail; windows in which
+# more and less moves; and an error that sees the order of greys, faint or strong.
+PLAIN = replace(
+    EVEN,
+    steps=4200,
+    renderings=8,
+    motion=(0.2, 8.0),
+    seed=6,
+    loss=replace(EVEN.loss, equalised=0.6, equalised_mse=4.0),
+    scene=SceneSettings(objects=2, pause=0.2, still=0.03, plain=0.12),
+)
+# ON and OFF thresholds that differ, because with nearly equal ones it learnt to count events and
+# trusted the sum: in recordings ON and OFF do not cancel, and the trails stayed.
+UNEVEN = replace(
+    PLAIN, steps=2800, learning_rate=1.3e-3, seed=7, sensor=replace(PLAIN.sensor, asymmetry=0.2)
+)
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
@@ -128,6 +145,8 @@ STAGES = {
     "last": (LAST, None),
     "long": (LONG, 5500),
     "even": (EVEN, 3200),
+    "plain": (PLAIN, 1200),
+    "uneven": (UNEVEN, None),
 }
 
 

@@ -19,6 +19,8 @@ TIME_BATCH = P(None, "devices")  # the second one of what comes in windows
 def join(coordinator: str | None, processes: int | None, process: int | None) -> None:
     """Becomes one of several processes, on this machine or on many; nothing where all are None."""
     if coordinator is not None:
+        # Else SIGTERM would only be noted down, for programs that ask for it, and ended by nothing.
+        jax.config.update("jax_enable_preemption_service", False)
         jax.distributed.initialize(coordinator, processes, process)
 
 

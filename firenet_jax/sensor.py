@@ -48,7 +48,10 @@ class SensorSettings:
     threshold_spread: float = 0.03
     """Standard deviation of the thresholds, ON and OFF each drawn once for a sequence."""
     threshold_range: tuple[float, float] | None = None
-    """Draw the ON threshold log-uniformly from here instead, OFF within 10 % of it."""
+    """Draw the ON threshold log-uniformly from here instead, and OFF about as large."""
+    asymmetry: float = 0.1
+    """Standard deviation of OFF in parts of ON, where they are drawn from `threshold_range`: a
+    pixel that was darker for a while does not count back to where it was."""
     refractory: float = 1e-3
     """Seconds after an event in which a pixel stays silent."""
     refractory_range: tuple[float, float] | None = None
@@ -131,7 +134,7 @@ def random_sensor(
         on, off = settings.threshold + settings.threshold_spread * spread
     else:
         on = log_uniform(settings.threshold_range)
-        off = on * (1 + 0.1 * spread[0])
+        off = on * (1 + settings.asymmetry * spread[0])
     if settings.mismatch:
         own = settings.mismatch * jax.random.normal(mismatch_key, (2, *shape))
         on, off = on + own[0], off + own[1]

@@ -20,7 +20,7 @@ def finish(*processes):
     try:
         for process in processes:
             _, errors = process.communicate(timeout=300)
-            assert process.returncode == 0, errors[-2000:]
+            assert process.returncode == 0, f"exit {process.returncode}: {errors[-2000:]}"
     finally:  # one that failed leaves the others waiting
         for process in processes:
             process.kill()

@@ -238,12 +238,13 @@ def test_thresholds_are_drawn_as_the_paper_says():
     assert sensors.drift is None and sensors.noise is None and sensors.cutoff is None
 
 
-def test_wide_thresholds_and_mismatch():
-    settings = SensorSettings(threshold_range=(0.1, 1.7))
+@pytest.mark.parametrize("asymmetry", [0.1, 0.25])
+def test_wide_thresholds_and_mismatch(asymmetry):
+    settings = SensorSettings(threshold_range=(0.1, 1.7), asymmetry=asymmetry)
     draw = jax.vmap(lambda key: random_sensor(key, height=2, width=2, settings=settings))
     sensors = draw(jax.random.split(jax.random.key(1), 500))
     assert 0.1 <= sensors.on.min() < 0.12 and 1.5 < sensors.on.max() <= 1.7
-    assert abs(np.std(sensors.off / sensors.on) - 0.1) < 0.02
+    assert abs(np.std(sensors.off / sensors.on) - asymmetry) < 0.2 * asymmetry
     own = random_sensor(
         jax.random.key(2), height=80, width=90, settings=SensorSettings(mismatch=0.03)
     )

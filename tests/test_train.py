@@ -1,4 +1,5 @@
 import json
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,6 +99,22 @@ def test_four_devices_and_two_processes_learn_what_one_device_learns(tmp_path):
                 assert other["gradient"] == pytest.approx(entry["gradient"], rel=1e-2), entry
     for name in ("one", "four", "two"):
         assert (tmp_path / name / "weights.npz").exists()
+
+
+TERMINATED = """
+import os, signal, sys, time
+import jax
+from firenet_jax.devices import join
+join(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
+jax.devices()
+os.kill(os.getpid(), signal.SIGTERM)
+time.sleep(20)
+"""
+
+
+def test_one_of_several_processes_ends_when_it_is_told_to():
+    with pytest.raises(AssertionError, match=f"exit -{signal.SIGTERM:d}"):
+        together(TERMINATED, processes=1)
 
 
 def test_a_batch_that_devices_cannot_share_is_refused(tmp_path, monkeypatch):
