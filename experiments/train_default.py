@@ -7,9 +7,9 @@ Stages, each in a folder of its own under RUN and from the last weights of the o
 interrupted one goes on where it was. First clean sensors and windows in which much moves, because
 there is most to learn from them; then the faults of real sensors, longer sequences and slower ones;
 then windows in which next to nothing moves, as in most recordings; then a sharper loss; then
-mostly clean sensors again; then a loss that sees faint structure and flicker; at last objects before
-blank grounds and uneven thresholds, so that it forgets what has passed. Each was a lesson of the
-one before.
+mostly clean sensors again; then a loss that sees faint structure and flicker; at last objects
+before blank grounds and uneven thresholds, so that it forgets what has passed. Each was a lesson of
+the one before.
 
 PICTURES were 63: scikit-image's own (`scenes.PHOTOGRAPHS`), matplotlib's sample data, and those
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
