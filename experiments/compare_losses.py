@@ -42,6 +42,9 @@ CANDIDATES = {
     "l1 + nlpd + haarpsi": replace(NONE, l1=1.0, nlpd=0.5, haarpsi=0.5),
     "l1 + nlpd + ssim + haarpsi": replace(NONE, l1=0.5, nlpd=0.5, ssim=0.5, haarpsi=0.5),
     "l1 + nlpd + haarpsi + equalised": replace(NONE, l1=0.5, nlpd=0.5, haarpsi=0.5, equalised=0.5),
+    "l1 + nlpd + haarpsi + equalised_mse": replace(
+        NONE, l1=0.5, nlpd=0.5, haarpsi=0.5, equalised_mse=4.0
+    ),
     "l1 + nlpd + cw_ssim": replace(NONE, l1=1.0, nlpd=0.5, cw_ssim=0.5),
     "l1 + random_features": replace(NONE, l1=2.0, random_features=0.5),
 }

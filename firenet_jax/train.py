@@ -571,14 +571,27 @@ def _check_finite(terms: dict[str, float], state: TrainState, folder: Path) -> N
         )
 
 
-def _same_settings(folder: Path, settings: Train) -> None:
-    """Keeps the settings in the folder; raises ValueError if a run of others is there."""
-    folder.mkdir(parents=True, exist_ok=True)
+def _as_text(settings: Train) -> str:
     where = {"output", "coordinator", "processes", "process"}  # not what is computed
     choices = {k: v for k, v in dataclasses.asdict(settings).items() if k not in where}
-    text = json.dumps(choices, default=str, indent=1)
+    return json.dumps(choices, default=str, indent=1)
+
+
+def _filled(found: dict, defaults: dict) -> dict:
+    """The same with the defaults that it lacks, in the dicts within it too."""
+    inner = {k: _filled(v, defaults.get(k, {})) for k, v in found.items() if isinstance(v, dict)}
+    return defaults | found | inner
+
+
+def _same_settings(folder: Path, settings: Train) -> None:
+    """Keeps the settings in the folder; raises ValueError if a run of others is there.
+
+    Options that the run there does not know, as it is older than they are, count as their defaults.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    text, defaults = _as_text(settings), json.loads(_as_text(Train(folder)))
     path = folder / "settings.json"
-    if path.exists() and path.read_text() != text:
+    if path.exists() and _filled(json.loads(path.read_text()), defaults) != json.loads(text):
         raise ValueError(f"{folder} holds a run with other settings: choose another --output")
     if _first():
         whole = path.with_suffix(".part")  # other processes may be looking

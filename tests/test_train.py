@@ -161,6 +161,18 @@ def test_other_settings_do_not_continue_a_run(tmp_path):
         train._same_settings(tmp_path, tiny(tmp_path, seed=1))
 
 
+def test_a_run_older_than_an_option_goes_on_if_that_stands_at_its_default(tmp_path):
+    train._same_settings(tmp_path, tiny(tmp_path))
+    path = tmp_path / "settings.json"
+    older = json.loads(path.read_text())
+    del older["remat"], older["scene"]["plain"]
+    path.write_text(json.dumps(older))
+    other = tiny(tmp_path).scene
+    with pytest.raises(ValueError, match="other settings"):
+        train._same_settings(tmp_path, tiny(tmp_path, scene=replace(other, plain=0.5)))
+    train._same_settings(tmp_path, tiny(tmp_path))
+
+
 def test_another_process_never_sees_half_of_the_settings(tmp_path, monkeypatch):
     settings, write = Train(output=tmp_path), Path.write_text
 
