@@ -8,8 +8,8 @@ interrupted one goes on where it was. First clean sensors and windows in which m
 there is most to learn from them; then the faults of real sensors, longer sequences and slower ones;
 then windows in which next to nothing moves, as in most recordings; then a sharper loss; then
 mostly clean sensors again; then a loss that sees faint structure and flicker; at last objects
-before blank grounds and uneven thresholds, so that it forgets what has passed. Each was a lesson of
-the one before.
+before blank grounds and uneven thresholds, to teach it to forget what has passed. Each was a lesson
+of the one before.
 
 PICTURES were 63: scikit-image's own (`scenes.PHOTOGRAPHS`), matplotlib's sample data, and those
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
@@ -135,8 +135,8 @@ PLAIN = replace(
     loss=replace(EVEN.loss, equalised=0.6, equalised_mse=4.0),
     scene=SceneSettings(objects=2, pause=0.2, still=0.03, plain=0.12),
 )
-# ON and OFF thresholds that differ, because with nearly equal ones it learnt to count events and
-# trusted the sum: in recordings ON and OFF do not cancel, and the trails stayed.
+# ON and OFF thresholds that differ: of nearly equal ones it can trust the sum, but in recordings ON
+# and OFF do not cancel. (Trails became fainter, they did not go.)
 UNEVEN = replace(
     PLAIN, steps=2800, learning_rate=1.3e-3, seed=7, sensor=replace(PLAIN.sensor, asymmetry=0.2)
 )
