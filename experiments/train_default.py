@@ -15,8 +15,8 @@ PICTURES were 63: scikit-image's own (`scenes.PHOTOGRAPHS`), matplotlib's sample
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
 Elephants) and plasma-workspace-wallpapers. No picture of `scenes.HELD_OUT` was among them.
 
-Built in is RUN/weights.npz: the mean of the last weights of "even" and "uneven", which is better
-than either (Wortsman et al., "Model soups", ICML 2022).
+Built in is RUN/weights.npz: the mean of the last weights of "even" and "uneven" (Wortsman et al.,
+"Model soups", ICML 2022), preferred to either by the sequences of shipped_weights.py.
 
 The report is written to results/train_default.json, the curve to results/train_default.png.
 """

@@ -460,8 +460,8 @@ def random_setups(
 
     The windows of a sequence all last equally long: so that at its fastest time the fastest point
     moves by so many pixels as `motion` says (least, greatest; log-uniform), but 1 to 300 ms.
-    Raises ValueError where that is more than a pixel from one rendering to the next, the most that
-    keeps events true (Gehrig et al., "Video to Events", CVPR 2020).
+    Raises ValueError where that is more than a pixel from one rendering to the next, the bound of
+    Gehrig et al., "Video to Events", CVPR 2020.
     """
     if motion[1] > renderings:
         raise ValueError(
