@@ -1,12 +1,15 @@
 """Functions -> times, side by side: what the benchmark scripts share.
 
-Machines are noisy, so methods are timed in turn, A B C A B C ..., and compared by the ratio of
-their medians within one run.
+Machines are noisy, so methods are timed in rounds of one run each, and compared by the ratio of
+their medians within one run. Each round has an order of its own, because what a method leaves in
+the caches and what threads it leaves spinning costs the one after it: always the same one, it would
+be a difference between the methods.
 """
 
 import json
 import os
 import platform
+import random
 import statistics
 import time
 from collections.abc import Callable
@@ -27,11 +30,12 @@ def interleaved(
     for method in methods.values():  # compilation, caches
         method()
     seconds: dict[str, list[float]] = {name: [] for name in methods}
+    order = random.Random(0)
     for _ in range(runs):
-        for name, method in methods.items():
+        for name in order.sample(list(methods), len(methods)):
             time.sleep(rest)
             start = time.perf_counter()
-            method()
+            methods[name]()
             seconds[name].append(time.perf_counter() - start)
     return seconds
 
