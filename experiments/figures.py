@@ -21,8 +21,9 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from firenet_jax import metrics
+from firenet_jax.comparison import to_8_bit
 from firenet_jax.equalise import equalise
-from firenet_jax.evaluate import CUTS, to_8_bit
+from firenet_jax.evaluate import CUTS
 from firenet_jax.events import Frames, Recording, concatenate
 from firenet_jax.filters import between
 from firenet_jax.methods import Method, Missing, load

@@ -11,8 +11,9 @@ from skimage.metrics import structural_similarity
 
 from firenet_jax import cli, evaluate, methods, metrics
 from firenet_jax.checkpoint import save_weights
+from firenet_jax.comparison import COMPARED, Gap, matched
 from firenet_jax.dataset import Picture, write_sequence
-from firenet_jax.evaluate import Evaluate, interval, matched, plan, run
+from firenet_jax.evaluate import Evaluate, interval, plan, run
 from firenet_jax.events import Events
 from firenet_jax.methods import Missing, load
 from firenet_jax.network import Weights, initial_params
@@ -262,7 +263,7 @@ def test_intervals_of_the_event_camera_dataset(tmp_path):
     assert counted(warm_up=0.0) == pytest.approx((1.0, 2.5, 0.9))
     assert counted(warm_up=0.35) == pytest.approx((1.0, 2.5, 0.6))
     assert counted(start=1.0, stop=1.05, warm_up=0.2)[:2] == pytest.approx((1.0, 1.0))
-    with pytest.raises(evaluate.Gap, match="no frames from 7 to 8 s"):
+    with pytest.raises(Gap, match="no frames from 7 to 8 s"):
         counted(start=7.0, stop=8.0)
 
 
@@ -415,5 +416,5 @@ def test_ticks_are_few_round_and_enclose(low, high, expected):
 
 
 def test_metrics_are_known_by_name():
-    assert set(evaluate.COMPARED) | {"lpips", "temporal_error"} == set(METRICS)
-    assert all(callable(getattr(metrics, name)) for name in evaluate.COMPARED)
+    assert set(COMPARED) | {"lpips", "temporal_error"} == set(METRICS)
+    assert all(callable(getattr(metrics, name)) for name in COMPARED)

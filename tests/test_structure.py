@@ -29,6 +29,7 @@ LAYERS = [
     ["reconstruction", "sensor"],
     ["baselines"],
     ["info", "pipeline", "dataset", "batches", "methods", "report"],
+    ["comparison"],
     ["train", "evaluate"],
     ["demo"],
     ["cli"],

@@ -1,0 +1,192 @@
+"""Images of a method, frames of a camera -> numbers and pictures, batch by batch.
+
+An image (H, W) float32 counts for the frame that is closest to it in time. Both are clipped to 0 to
+1 and equalised before they are compared; the temporal error is of images that are not equalised.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from firenet_jax import lpips, metrics
+from firenet_jax.equalise import Kind, equalise
+from firenet_jax.events import Recording
+from firenet_jax.report import METRICS
+
+BATCH = 8  # images that are compared at once
+STILLS = (0.2, 0.55, 0.9)  # places of the pictures that are kept, in the part that counts
+CLIP = 60  # pictures of a video
+
+COMPARED = [name for name in METRICS if name not in ("lpips", "temporal_error")]
+
+
+class Gap(Exception):
+    """Why a number is not there, in a few words for a table."""
+
+
+class Plan(NamedTuple):
+    """What of a recording is reconstructed, and what of it counts."""
+
+    name: str
+    recording: Recording
+    numbers: np.ndarray  # (F,) of the frames that are used, in the recording
+    times: np.ndarray  # (F,) int64, microseconds
+    first: int  # of these, the frames first <= i < last count
+    last: int
+    origin: int  # microseconds: the sequence's beginning
+    span: tuple[float, float | None]  # seconds after the first event: what is reconstructed
+
+
+class Comparison(NamedTuple):
+    """What one image is compared with."""
+
+    place: int  # of the frame, in Plan.times
+    image: jax.Array  # (H, W), raw
+    truth: np.ndarray  # (H, W) uint8
+    flow: np.ndarray | None  # (H, W, 2) pixels since the frame before
+
+
+def matched(
+    predictions: Iterator[tuple[int, jax.Array]], times: np.ndarray, tolerance: int
+) -> Iterator[tuple[int, jax.Array]]:
+    """(time, image) in time order -> (place of a frame, image): of each frame the closest
+    prediction, if that is at most `tolerance` microseconds away."""
+    best: tuple[int, int, jax.Array] | None = None
+    for moment, image in predictions:
+        after = int(np.searchsorted(times, moment))
+        near = [place for place in (after - 1, after) if 0 <= place < len(times)]
+        place = min(near, key=lambda place: abs(int(times[place]) - moment))
+        distance = abs(int(times[place]) - moment)
+        if distance > tolerance:
+            continue
+        if best is not None and best[0] != place:
+            yield best[0], best[2]
+            best = None
+        if best is None or distance < best[1]:
+            best = place, distance, image
+    if best is not None:
+        yield best[0], best[2]
+
+
+class Numbers:
+    """The numbers of one method's images of one sequence, batch by batch."""
+
+    def __init__(self, plan: Plan, kind: Kind, learned: lpips.Lpips | None):
+        self.plan, self.kind = plan, kind
+        small = min(plan.recording.height, plan.recording.width) < lpips.SMALLEST
+        self.learned = None if small else learned
+        self.no_lpips = "no weights" if learned is None else "pictures too small"
+        self.places: list[int] = []
+        self.values = {name: [] for name in METRICS if name != "lpips" or self.learned}
+        self.last: tuple[int, np.ndarray, np.ndarray] | None = None  # place, image, truth
+
+    def add(self, batch: list[Comparison]) -> tuple[np.ndarray, np.ndarray]:
+        """Measures; returns images and truths as they were compared, (n, H, W) float32."""
+        places = [entry.place for entry in batch]
+        images = np.stack(jax.device_get([entry.image for entry in batch]))
+        if not np.isfinite(images).all():
+            bad = places[int(np.argmin(np.isfinite(images).all((1, 2))))]
+            raise Gap(f"image of frame {self.plan.numbers[bad] + 1} is not finite")
+        images = np.clip(images, 0, 1)
+        truths = np.stack([entry.truth for entry in batch]).astype(np.float32) / 255
+        compared = equalise(images, self.kind), equalise(truths, self.kind)
+        count = len(batch)
+        for name, values in _compare(*map(_whole, compared)).items():
+            self.values[name] += values[:count].tolist()
+        if self.learned:
+            distances = lpips.lpips(self.learned, *map(_whole, compared))
+            self.values["lpips"] += distances[:count].tolist()
+        self.values["temporal_error"] += self._temporal(batch, images, truths)
+        self.places += places
+        return compared
+
+    def _temporal(self, batch, images, truths) -> list[float | None]:
+        """Of images that are not equalised: it is flicker that counts, not contrast."""
+        last = self.last or (-1, images[0], truths[0])
+        befores = [last[0], *(entry.place for entry in batch[:-1])]
+        self.last = batch[-1].place, images[-1], truths[-1]
+        known = [
+            entry.flow is not None and entry.place == before + 1
+            for entry, before in zip(batch, befores, strict=True)
+        ]
+        if not any(known):
+            return [None] * len(batch)
+        still = np.zeros((*images.shape[1:], 2), np.float32)
+        flows = np.stack([e.flow if k else still for e, k in zip(batch, known, strict=True)])
+        previous = np.concatenate([last[1][None], images[:-1]])
+        previous_truths = np.concatenate([last[2][None], truths[:-1]])
+        errors = metrics.temporal_error(
+            *map(_whole, (images, previous, flows, truths, previous_truths))
+        ).tolist()
+        return [error if k else None for error, k in zip(errors, known, strict=False)]
+
+    def result(self, empty: int, seconds: float) -> dict:
+        """Ready for JSON: a value that is not finite becomes null, its metric a gap."""
+        gaps = {}
+        values = {}
+        for name, series in self.values.items():
+            good = [value is None or math.isfinite(value) for value in series]
+            if not all(good):
+                place = self.places[good.index(False)]
+                gaps[name] = f"infinite at frame {self.plan.numbers[place] + 1}"
+            elif all(value is None for value in series):
+                gaps[name] = "no flow"
+            values[name] = [v if ok else None for v, ok in zip(series, good, strict=True)]
+        if not self.learned:
+            gaps["lpips"] = self.no_lpips
+        return {
+            "frames": len(self.places),
+            "of": self.plan.last - self.plan.first,
+            "windows_without_events": empty,
+            "seconds": round(seconds, 3),
+            "gaps": gaps,
+            "frame_numbers": [int(self.plan.numbers[place]) for place in self.places],
+            "times": [
+                round((int(t) - self.plan.origin) / 1e6, 6) for t in self.plan.times[self.places]
+            ],
+            "values": values,
+        }
+
+
+def _whole(batch: np.ndarray) -> np.ndarray:
+    """(n, ...) -> (BATCH, ...), the last entry repeated: one size compiles once."""
+    return np.concatenate([batch, np.repeat(batch[-1:], BATCH - len(batch), 0)])
+
+
+@jax.jit
+def _compare(images: jax.Array, truths: jax.Array) -> dict[str, jax.Array]:
+    return {name: getattr(metrics, name)(images, truths) for name in COMPARED}
+
+
+class Pictures:
+    """The few pictures that the report shows, out of all: stills and a stretch for the video."""
+
+    def __init__(self, plan: Plan):
+        count = plan.last - plan.first
+        self.numbers = plan.numbers
+        self.wanted = [plan.first + int(share * count) for share in STILLS]
+        self.begin = plan.first + max(0, (count - CLIP) // 2)
+        self.kept: dict[str, list] = {"stills": [], "clip": []}
+
+    def add(self, batch: list[Comparison], compared: tuple[np.ndarray, np.ndarray]) -> None:
+        for entry, image in zip(batch, compared[0], strict=True):
+            picture = int(self.numbers[entry.place]), to_8_bit(image)
+            if self.wanted and entry.place >= self.wanted[0]:
+                self.wanted = [place for place in self.wanted if place > entry.place]
+                self.kept["stills"].append(picture)
+            if entry.place >= self.begin and len(self.kept["clip"]) < CLIP:
+                self.kept["clip"].append(picture)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        arrays = {}
+        for name, kept in self.kept.items():
+            arrays[f"{name}_frames"] = np.array([number for number, _ in kept], np.int64)
+            arrays[name] = np.array([picture for _, picture in kept], np.uint8)
+        return arrays
+
+
+def to_8_bit(image: np.ndarray) -> np.ndarray:
+    return np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
