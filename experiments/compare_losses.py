@@ -27,8 +27,8 @@ from firenet_jax.equalise import equalise
 from firenet_jax.losses import Loss
 from firenet_jax.network import initial_state
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.scenes import HELD_OUT, load_textures, photographs
 from firenet_jax.sensor import sequences
+from firenet_jax.textures import HELD_OUT, load_textures, photographs
 from firenet_jax.train import run
 
 NONE = Loss(l1=0, nlpd=0, haarpsi=0)

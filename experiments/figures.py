@@ -1,6 +1,6 @@
 """Recordings or simulated scenes -> labelled pictures: what the scripts of the figures share.
 
-A simulated scene shows the pictures that no network here was trained on (`scenes.HELD_OUT`), so
+A simulated scene shows the pictures that no network here was trained on (`textures.HELD_OUT`), so
 that it judges built-in weights fairly. What cannot be shown is a named gap: a grey cell that says
 why, and a sentence under the figure.
 """
@@ -29,18 +29,10 @@ from firenet_jax.filters import between
 from firenet_jax.methods import Method, Missing, load
 from firenet_jax.pictures import event_pictures
 from firenet_jax.readers import open_recording
-from firenet_jax.scenes import (
-    HELD_OUT,
-    SceneSettings,
-    load_textures,
-    photographs,
-    random_scene,
-    render,
-    rendering_times,
-    video,
-)
+from firenet_jax.scenes import SceneSettings, random_scene, render, rendering_times, video
 from firenet_jax.sensor import FAULTY, SensorSettings, event_list, random_sensor
 from firenet_jax.tensors import pack, voxelise
+from firenet_jax.textures import HELD_OUT, load_textures, photographs
 from firenet_jax.windows import Window, Windows, cut
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -3,7 +3,7 @@
     python experiments/shipped_weights.py PUBLISHED [RECORDING...] [--weights OURS]      10 minutes
 
 Simulated: textures from the five pictures that are frozen by name and in no training pool
-(`scenes.HELD_OUT`), slow and fast, with the faults of real sensors and without; means over the
+(`textures.HELD_OUT`), slow and fast, with the faults of real sensors and without; means over the
 last 20 of 40 windows of 16 sequences of 240x180. Local equalisation is that of `equalise`.
 Recordings: three windows of each after warming up, the same windows for both networks; event
 pictures, theirs, ours. Writes results/shipped_weights.json, docs/shipped_simulated.jpg and
@@ -28,8 +28,9 @@ from firenet_jax.info import describe
 from firenet_jax.network import initial_state
 from firenet_jax.pictures import Display, display, event_pictures, initial_display_state
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.scenes import HELD_OUT, SceneSettings, load_textures, photographs
+from firenet_jax.scenes import SceneSettings
 from firenet_jax.sensor import FAULTY, SensorSettings, sequences
+from firenet_jax.textures import HELD_OUT, load_textures, photographs
 
 DOCS = Path(__file__).parents[1] / "docs"
 HEIGHT, WIDTH, WINDOWS, JUDGED, BATCH, BATCHES = 180, 240, 40, 20, 2, 8

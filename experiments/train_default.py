@@ -11,9 +11,9 @@ mostly clean sensors again; then a loss that sees faint structure and flicker; a
 before blank grounds and uneven thresholds, to teach it to forget what has passed. Each was a lesson
 of the one before.
 
-PICTURES were 63: scikit-image's own (`scenes.PHOTOGRAPHS`), matplotlib's sample data, and those
+PICTURES were 63: scikit-image's own (`textures.PHOTOGRAPHS`), matplotlib's sample data, and those
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
-Elephants) and plasma-workspace-wallpapers. No picture of `scenes.HELD_OUT` was among them.
+Elephants) and plasma-workspace-wallpapers. No picture of `textures.HELD_OUT` was among them.
 
 Built in is RUN/weights.npz: the mean of the last weights of "even" and "uneven" (Wortsman et al.,
 "Model soups", ICML 2022), preferred to either by the sequences of shipped_weights.py.

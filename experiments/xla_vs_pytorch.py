@@ -56,9 +56,10 @@ from firenet_jax.events import Events
 from firenet_jax.losses import Loss
 from firenet_jax.network import Weights, initial_params, initial_state, step
 from firenet_jax.reconstruction import Network, events_to_pictures, initial_session, reconstruct
-from firenet_jax.scenes import SceneSettings, load_textures
+from firenet_jax.scenes import SceneSettings
 from firenet_jax.sensor import SensorSettings
 from firenet_jax.tensors import pack
+from firenet_jax.textures import load_textures
 from firenet_jax.train import TEXTURE, Train, initial_train_state, simulated, train_step
 
 matplotlib.use("Agg")

@@ -35,16 +35,9 @@ from tqdm import tqdm
 
 from firenet_jax.events import Events, concatenate, parse_size
 from firenet_jax.overlap import ahead
-from firenet_jax.scenes import (
-    Scene,
-    SceneSettings,
-    flow,
-    load_textures,
-    random_scene,
-    rendering_times,
-    video,
-)
+from firenet_jax.scenes import Scene, SceneSettings, flow, random_scene, rendering_times, video
 from firenet_jax.sensor import FAULTY, LONGEST, SensorSettings, event_list, random_sensor
+from firenet_jax.textures import load_textures
 from firenet_jax.video import OutputError, partial_name
 
 ROWS = 1 << 16  # events in a chunk of the file, and so many are written at once

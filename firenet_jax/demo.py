@@ -25,15 +25,9 @@ from firenet_jax.network import Weights, initial_state
 from firenet_jax.overlap import ahead
 from firenet_jax.pictures import Display, display, event_pictures, initial_display_state
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.scenes import (
-    HELD_OUT,
-    Scene,
-    SceneSettings,
-    load_textures,
-    photographs,
-    random_scene,
-)
+from firenet_jax.scenes import Scene, SceneSettings, random_scene
 from firenet_jax.sensor import FAULTY, Sensor, SensorSettings, random_sensor, simulate
+from firenet_jax.textures import HELD_OUT, load_textures, photographs
 from firenet_jax.video import check_output, open_writer
 
 WINDOWS = 10  # simulated and reconstructed at once

@@ -58,7 +58,7 @@ from firenet_jax.events import logger
 from firenet_jax.losses import Loss, sequence_loss
 from firenet_jax.network import State, Weights, initial_params, initial_state, step
 from firenet_jax.pictures import event_pictures
-from firenet_jax.scenes import SceneSettings, load_textures
+from firenet_jax.scenes import SceneSettings
 from firenet_jax.sensor import (
     FAULTY,
     SensorSettings,
@@ -69,6 +69,7 @@ from firenet_jax.sensor import (
     simulate,
 )
 from firenet_jax.tensors import normalise
+from firenet_jax.textures import load_textures
 
 TEXTURE = 256  # pixels on a side of a texture
 VALIDATION = 8  # batches

@@ -12,7 +12,7 @@ from firenet_jax import dataset
 from firenet_jax.batches import NOTHING, Augment, _pauses, _simulation, batches, find, split
 from firenet_jax.dataset import Picture, Simulate, write_sequence
 from firenet_jax.events import Events, RecordingError
-from firenet_jax.scenes import load_textures
+from firenet_jax.textures import load_textures
 from firenet_jax.warp import warp
 
 HEIGHT, WIDTH, IMAGES, CROP, WINDOWS, BATCH = 20, 24, 13, 16, 4, 3

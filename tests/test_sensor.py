@@ -11,7 +11,7 @@ from firenet_jax import sensor as module
 from firenet_jax.events import Events, concatenate
 from firenet_jax.network import initial_state
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.scenes import SceneSettings, load_textures, rendering_times, video
+from firenet_jax.scenes import SceneSettings, rendering_times, video
 from firenet_jax.sensor import (
     EPS,
     FAULTY,
@@ -24,6 +24,7 @@ from firenet_jax.sensor import (
     simulate,
 )
 from firenet_jax.tensors import pack, voxelise
+from firenet_jax.textures import load_textures
 
 H, W = 12, 14
 

@@ -9,9 +9,10 @@ from firenet_jax.checkpoint import convert
 from firenet_jax.events import concatenate
 from firenet_jax.network import initial_state
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.scenes import load_textures, video
+from firenet_jax.scenes import video
 from firenet_jax.sensor import event_list, random_setups
 from firenet_jax.tensors import pack, voxelise
+from firenet_jax.textures import load_textures
 
 T, SIZE, RENDERINGS = 12, 96, 5
 

@@ -24,7 +24,7 @@ LAYERS = [
         "equalise",
         "devices",
     ],
-    ["readers", "windows", "network", "metrics", "scenes", "lpips"],
+    ["readers", "windows", "network", "metrics", "scenes", "textures", "lpips"],
     ["filters", "tensors", "checkpoint", "losses"],
     ["reconstruction", "sensor"],
     ["baselines"],

@@ -15,7 +15,8 @@ from firenet_jax.dataset import Picture, write_sequence
 from firenet_jax.events import Events
 from firenet_jax.losses import Loss
 from firenet_jax.network import Weights, initial_params
-from firenet_jax.scenes import SceneSettings, load_textures
+from firenet_jax.scenes import SceneSettings
+from firenet_jax.textures import load_textures
 from firenet_jax.train import Log, Train, images_of, initial_train_state, run, train_step
 
 
@@ -71,7 +72,8 @@ from pathlib import Path
 from firenet_jax.dataset import Picture, write_sequence
 from firenet_jax.events import Events
 from firenet_jax.losses import Loss
-from firenet_jax.scenes import SceneSettings, load_textures
+from firenet_jax.scenes import SceneSettings
+from firenet_jax.textures import load_textures
 from firenet_jax.train import Train, run
 
 folder, chain, *where = sys.argv[1:]
