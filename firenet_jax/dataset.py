@@ -34,11 +34,11 @@ import tyro
 from tqdm import tqdm
 
 from firenet_jax.events import Events, concatenate, parse_size
+from firenet_jax.files import OutputError, partial_name, write_text, writing
 from firenet_jax.overlap import ahead
 from firenet_jax.scenes import Scene, SceneSettings, flow, random_scene, rendering_times, video
 from firenet_jax.sensor import FAULTY, LONGEST, SensorSettings, event_list, random_sensor
 from firenet_jax.textures import load_textures
-from firenet_jax.video import OutputError, partial_name
 
 ROWS = 1 << 16  # events in a chunk of the file, and so many are written at once
 GZIP = 4  # for 50 % more time than level 1: events take 10 % less room, flow 25 %
@@ -138,7 +138,7 @@ def write_sequence(
     """
     beside = partial_name(path)
     try:
-        with _writing(path), h5py.File(beside, "w") as file:
+        with writing(path), h5py.File(beside, "w") as file:
             times, flows = _write_pictures(file, pictures, height, width)
             count, facts = _write_events(file, events, times)
             file.attrs.update(
@@ -149,7 +149,7 @@ def write_sequence(
                 settings=json.dumps(settings or {}),
                 **facts,
             )
-        with _writing(path):
+        with writing(path):
             beside.replace(path)
     except BaseException:
         beside.unlink(missing_ok=True)
@@ -158,23 +158,6 @@ def write_sequence(
         for stream in (events, pictures):
             getattr(stream, "close", bool)()  # of generators: ends their threads, closes files
     return count
-
-
-class _writing:
-    """h5py's errors of writing, as one sentence. Those of the streams are not OSErrors."""
-
-    def __init__(self, path: Path):
-        self.path = path
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, kind, error, trace):
-        if isinstance(error, OSError):
-            raise OutputError(
-                f"{self.path}: cannot write ({error.strerror or error}): nothing is under this "
-                "name; make room or choose another output"
-            ) from error
 
 
 def _write_pictures(file, pictures: Iterable[Picture], height, width) -> tuple[np.ndarray, int]:
@@ -416,9 +399,7 @@ def open_folder(settings: Simulate) -> None:
             for left in (folder / name).glob("*.partial.h5"):  # of a run that was killed
                 left.unlink()
         if not kept.is_file():
-            beside = partial_name(kept)
-            beside.write_text(json.dumps(record, indent=1) + "\n")
-            beside.replace(kept)
+            write_text(kept, json.dumps(record, indent=1) + "\n")
     except OSError as error:
         raise OutputError(
             f"{folder}: cannot write there ({error.strerror or error}): choose another output"

@@ -43,12 +43,13 @@ from firenet_jax.comparison import (
 )
 from firenet_jax.equalise import Kind, equalise
 from firenet_jax.events import Frames, Recording, RecordingError, logger, parse_size
+from firenet_jax.files import OutputError, read_arrays, write_arrays, write_text
 from firenet_jax.filters import between
 from firenet_jax.methods import Method, Missing, digest, load
 from firenet_jax.overlap import ahead
 from firenet_jax.readers import FORMATS, open_recording, reading
 from firenet_jax.report import METRICS
-from firenet_jax.video import OutputError, partial_name, write_video
+from firenet_jax.video import write_video
 from firenet_jax.windows import Window, Windows, cut
 
 # Seconds from the beginning of the Event Camera Dataset's sequences (EVREAL's; one of E2VID's
@@ -462,16 +463,8 @@ def open_folder(settings: Evaluate, records: dict[tuple[str, str], dict]) -> dic
 
 def save(path: Path, record: dict, result: dict, pictures: dict[str, np.ndarray]) -> None:
     """The pictures first: numbers that are there mean that all is."""
-    beside = partial_name(path.with_suffix(".npz"))
-    np.savez_compressed(beside, **pictures)
-    beside.replace(path.with_suffix(".npz"))
+    write_arrays(path.with_suffix(".npz"), **pictures)
     write_text(path, json.dumps({"record": record, "result": result}, allow_nan=False))
-
-
-def write_text(path: Path, text: str) -> None:
-    beside = partial_name(path)
-    beside.write_text(text, encoding="utf-8")
-    beside.replace(path)
 
 
 # ---- Tables
@@ -581,8 +574,7 @@ def show(settings: Evaluate, plan: Plan, methods: dict) -> report.Shown:
     for name in methods:
         path = result_file(settings, plan.name, name).with_suffix(".npz")
         if path.is_file():
-            with np.load(path, allow_pickle=False) as saved:
-                kept[name] = {key: saved[key] for key in saved.files}
+            kept[name] = read_arrays(path)
     truths: dict[int, np.ndarray] = {}
 
     def truth(number: int) -> np.ndarray:

@@ -28,22 +28,14 @@ from firenet_jax import filters
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.devices import BATCH, EVERYWHERE, check_processes, in_a_row, join, shared
 from firenet_jax.events import Events, Recording, RecordingError, logger, parse_size
+from firenet_jax.files import OutputError, partial_name, read_arrays, writing
 from firenet_jax.network import Weights
 from firenet_jax.overlap import ahead
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import Network, Session, events_to_pictures, initial_session
 from firenet_jax.tensors import IN_LISTS, Packed, pack_for_devices
-from firenet_jax.video import (
-    VIDEOS,
-    FolderWriter,
-    OutputError,
-    VideoWriter,
-    check_output,
-    open_writer,
-    partial_name,
-    writing,
-)
+from firenet_jax.video import VIDEOS, FolderWriter, VideoWriter, check_output, open_writer
 from firenet_jax.windows import Window, Windows, cut
 
 # Settings that the pictures do not depend on, or that are told in another way.
@@ -464,16 +456,11 @@ def load_position(job: Job, settings: Reconstruct) -> tuple[int, Session]:
         unpublished.unlink()
     if job.output.suffix in VIDEOS or not path.exists():
         return 0, initial
-    try:
-        with np.load(path, allow_pickle=False) as saved:
-            record, done = str(saved["record"]), int(saved["pictures"])
-            leaves, tree = jax.tree.flatten(initial)
-            leaves = [saved[f"state{i}"] for i in range(len(leaves))]
-    except (OSError, ValueError, KeyError) as error:
-        raise OutputError(f"{path} is damaged ({error}): remove {path.parent}") from error
-    if record == job.record:
+    saved = read_arrays(path)
+    if str(saved.get("record")) == job.record:
+        done, tree = int(saved["pictures"]), jax.tree.structure(initial)
         logger.warning("%s: going on after %d pictures", job.output, done)
-        return done, jax.tree.unflatten(tree, leaves)
+        return done, tree.unflatten(saved[f"state{i}"] for i in range(tree.num_leaves))
     if not settings.overwrite:
         raise OutputError(
             f"{path.parent} holds an unfinished run of other settings or another recording: "

@@ -19,6 +19,7 @@ The sequences of a batch are dealt out to all devices of all processes; what is 
 depend on how many these are.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import json
@@ -55,6 +56,7 @@ from firenet_jax.devices import (
     shared,
 )
 from firenet_jax.events import logger
+from firenet_jax.files import write_text
 from firenet_jax.losses import Loss, sequence_loss
 from firenet_jax.network import State, Weights, initial_params, initial_state, step
 from firenet_jax.pictures import event_pictures
@@ -518,11 +520,10 @@ class Log:
 
     def __init__(self, folder: Path, step: int):
         self.path, self.start = folder / "log.jsonl", time.monotonic()
-        lines = self.path.read_text().splitlines() if self.path.exists() else []
-        self.entries = [entry for line in lines if (entry := json.loads(line))["step"] <= step]
+        self.entries = [entry for entry in _entries(self.path) if entry["step"] <= step]
         self.board = None
         if _first():
-            self.path.write_text("".join(json.dumps(entry) + "\n" for entry in self.entries))
+            write_text(self.path, "".join(json.dumps(entry) + "\n" for entry in self.entries))
             self.board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
 
     def write(self, step: int, kind: str, values: dict) -> dict[str, float]:
@@ -564,6 +565,13 @@ class Log:
             self.board.close()
 
 
+def _entries(path: Path) -> Iterator[dict]:
+    """Lines of a log, but what was half written when a run was killed."""
+    for line in path.read_text().splitlines() if path.exists() else []:
+        with contextlib.suppress(json.JSONDecodeError):
+            yield json.loads(line)
+
+
 def _check_finite(terms: dict[str, float], state: TrainState, folder: Path) -> None:
     if not np.isfinite(terms["loss"]) and int(state.optimiser.notfinite_count) >= 10:
         raise ValueError(
@@ -592,9 +600,12 @@ def _same_settings(folder: Path, settings: Train) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     text, defaults = _as_text(settings), json.loads(_as_text(Train(folder)))
     path = folder / "settings.json"
-    if path.exists() and _filled(json.loads(path.read_text()), defaults) != json.loads(text):
-        raise ValueError(f"{folder} holds a run with other settings: choose another --output")
+    if path.exists():
+        try:
+            found = _filled(json.loads(path.read_text()), defaults)
+        except (ValueError, AttributeError) as error:
+            raise ValueError(f"{path} is damaged ({error}): choose another --output") from error
+        if found != json.loads(text):
+            raise ValueError(f"{folder} holds a run with other settings: choose another --output")
     if _first():
-        whole = path.with_suffix(".part")  # other processes may be looking
-        whole.write_text(text)
-        whole.replace(path)
+        write_text(path, text)  # other processes may be looking

@@ -15,17 +15,10 @@ import av
 import numpy as np
 from PIL import Image
 
+from firenet_jax.files import OutputError, partial_name, writing
+
 VIDEOS = (".mp4", ".gif")
 PNG_LEVEL = 4  # on grey pictures 25 % faster than the default 6, files 2 % larger
-
-
-class OutputError(ValueError):
-    """A file cannot be written as asked; the message is one sentence."""
-
-
-def partial_name(path: Path) -> Path:
-    """Where an output is made: `video.mp4` -> `video.partial.mp4`, `out` -> `out.partial`."""
-    return path.with_name(f"{path.stem}.partial{path.suffix}")
 
 
 def check_output(path: Path, overwrite: bool) -> None:
@@ -53,18 +46,6 @@ def check_output(path: Path, overwrite: bool) -> None:
         ) from error
     if not os.access(path.parent, os.W_OK):
         raise OutputError(f"{path.parent} is not writable: choose another output")
-
-
-@contextlib.contextmanager
-def writing(path: Path):
-    """Full disks and the like, said with the name of the output."""
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(
-            f"{path}: cannot write ({error.strerror or error}): nothing is under this name yet; "
-            "make room or choose another output"
-        ) from error
 
 
 class FolderWriter:

@@ -10,11 +10,12 @@ import pytest
 from firenet_jax import cli, dataset
 from firenet_jax.dataset import Picture, Simulate, read_clip, rounded_flow, run, write_sequence
 from firenet_jax.events import Events, concatenate
+from firenet_jax.files import OutputError
 from firenet_jax.readers import open_recording
 from firenet_jax.scenes import SceneSettings
 from firenet_jax.sensor import EPS, FAULTY, SensorSettings
 from firenet_jax.textures import load_textures
-from firenet_jax.video import OutputError, write_video
+from firenet_jax.video import write_video
 from firenet_jax.warp import warp
 
 HEIGHT, WIDTH = 24, 32

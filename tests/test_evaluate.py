@@ -15,12 +15,12 @@ from firenet_jax.comparison import COMPARED, Gap, matched
 from firenet_jax.dataset import Picture, write_sequence
 from firenet_jax.evaluate import Evaluate, interval, plan, run
 from firenet_jax.events import Events
+from firenet_jax.files import OutputError
 from firenet_jax.methods import Missing, load
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pytorch_file import CheckpointError
 from firenet_jax.readers import open_recording
 from firenet_jax.report import METRICS, steps
-from firenet_jax.video import OutputError
 from firenet_jax.windows import Window
 
 HEIGHT, WIDTH = 20, 28
@@ -218,6 +218,17 @@ def test_an_interrupted_evaluation_goes_on(folder, tmp_path, monkeypatch):
     for kind in again["means"]:
         for name in ("hf", "mr"):
             assert again["means"][kind][name]["means"] == whole["means"][kind][name]["means"]
+
+
+def test_damaged_pictures_of_an_earlier_run_are_named(folder, tmp_path):
+    ours = settings(folder, tmp_path / "out", data=(folder / "data" / "a.h5",), methods="hf")
+    run(ours)
+    path = tmp_path / "out" / "results" / "a" / "hf.npz"
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(OutputError, match="hf.npz is damaged .*: remove it"):
+        run(ours)
+    path.unlink()
+    run(ours)
 
 
 def test_other_settings_are_refused_by_name_and_replaced_when_told(folder, tmp_path):

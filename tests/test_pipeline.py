@@ -12,6 +12,7 @@ from processes import finish, start, together
 from firenet_jax import pipeline
 from firenet_jax.checkpoint import save_weights
 from firenet_jax.events import RecordingError
+from firenet_jax.files import OutputError
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pictures import Display
 from firenet_jax.pipeline import Reconstruct, run
@@ -169,6 +170,22 @@ def test_other_settings_do_not_continue_an_unfinished_run(tmp_path, weights, mon
         run(settings(weights, (recording,), tmp_path / "out", **other))
     run(settings(weights, (recording,), tmp_path / "out", overwrite=True, **other))
     assert len(pictures_of(tmp_path / "out")[0]) == 15
+
+
+def test_what_an_interrupted_run_left_is_named_where_it_is_damaged(tmp_path, weights, monkeypatch):
+    recording = write_recording(tmp_path / "a.txt")
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "RESUME_EVERY", 0)
+        interrupt_after(patch, 9)
+        with pytest.raises(Interrupted):
+            run(settings(weights, (recording,), tmp_path / "out"))
+    kept = tmp_path / "out.partial" / "resume.npz"
+    kept.write_bytes(kept.read_bytes()[:-100])
+    with pytest.raises(OutputError, match="resume.npz is damaged .*: remove it"):
+        run(settings(weights, (recording,), tmp_path / "out"))
+    kept.unlink()
+    run(settings(weights, (recording,), tmp_path / "out"))
+    assert len(pictures_of(tmp_path / "out")[0]) == 30
 
 
 @pytest.mark.slow

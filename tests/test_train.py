@@ -173,17 +173,20 @@ def test_a_run_older_than_an_option_goes_on_if_that_stands_at_its_default(tmp_pa
     with pytest.raises(ValueError, match="other settings"):
         train._same_settings(tmp_path, tiny(tmp_path, scene=replace(other, plain=0.5)))
     train._same_settings(tmp_path, tiny(tmp_path))
+    path.write_text('{"steps": 1')
+    with pytest.raises(ValueError, match="settings.json is damaged"):
+        train._same_settings(tmp_path, tiny(tmp_path))
 
 
 def test_another_process_never_sees_half_of_the_settings(tmp_path, monkeypatch):
     settings, write = Train(output=tmp_path), Path.write_text
 
-    def write_with_a_look_in_between(path, text):
-        write(path, text[:10])
+    def write_with_a_look_in_between(path, text, **how):
+        write(path, text[:10], **how)
         with monkeypatch.context() as other:
             other.setattr(train, "_first", lambda: False)
             train._same_settings(tmp_path, settings)
-        write(path, text)
+        write(path, text, **how)
 
     monkeypatch.setattr(Path, "write_text", write_with_a_look_in_between)
     train._same_settings(tmp_path, settings)
@@ -203,6 +206,28 @@ def test_the_log_forgets_what_comes_after_the_checkpoint(tmp_path):
         log.write(step, "validation", {"loss": jnp.float32(10 - step)})
     assert [entry["step"] for entry in Log(tmp_path, 2).entries] == [1, 2]
     assert Log(tmp_path, 2).best() == 8
+
+
+def test_a_log_whose_last_line_is_half_written_goes_on(tmp_path):
+    Log(tmp_path, 0).write(1, "validation", {"loss": jnp.float32(3)})
+    with (tmp_path / "log.jsonl").open("a") as file:
+        file.write('{"step": 2, "kind": "val')
+    log = Log(tmp_path, 5)
+    log.write(6, "validation", {"loss": jnp.float32(2)})
+    assert [entry["step"] for entry in entries(tmp_path)] == [1, 6]
+
+
+def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypatch):
+    Log(tmp_path, 0).write(1, "validation", {"loss": jnp.float32(3)})
+
+    def killed(path, text, **how):
+        path.open("w").close()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Path, "write_text", killed)
+        Log(tmp_path, 1)
+    assert Log(tmp_path, 1).best() == 3
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from firenet_jax.video import FolderWriter, OutputError, VideoWriter, check_output, write_video
+from firenet_jax.files import OutputError
+from firenet_jax.video import FolderWriter, VideoWriter, check_output, write_video
 
 
 def ramp(count=6, height=30, width=41):

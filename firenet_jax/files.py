@@ -1,0 +1,58 @@
+"""What is written -> files that are whole: each is made beside its name, and gets it in the end.
+
+Files of our own that an earlier run left are read with the same care: whatever is wrong with one,
+the error names it.
+"""
+
+import contextlib
+from pathlib import Path
+
+import numpy as np
+
+
+class OutputError(ValueError):
+    """A file cannot be written as asked; the message is one sentence."""
+
+
+def partial_name(path: Path) -> Path:
+    """Where an output is made: `video.mp4` -> `video.partial.mp4`, `out` -> `out.partial`."""
+    return path.with_name(f"{path.stem}.partial{path.suffix}")
+
+
+@contextlib.contextmanager
+def writing(path: Path):
+    """Full disks and the like, said with the name of the output."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot write ({error.strerror or error}): nothing is under this name yet; "
+            "make room or choose another output"
+        ) from error
+
+
+def write_text(path: Path, text: str) -> None:
+    """Who reads the file, while this runs or after it was killed, finds the old text or the new."""
+    beside = partial_name(path)
+    with writing(path):
+        beside.write_text(text, encoding="utf-8")
+        beside.replace(path)
+
+
+def write_arrays(path: Path, **arrays) -> None:
+    """An .npz, likewise."""
+    beside = partial_name(path)
+    with writing(path):
+        np.savez_compressed(beside, **arrays)
+        beside.replace(path)
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """All of an .npz; never unpickles. Raises OutputError for one that is not whole."""
+    try:
+        # opened here, as numpy leaves a file that is no archive open
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except Exception as error:  # damaged bytes reach every kind: Value, BadZip, EOF, tokenize's
+        reason = " ".join(str(error).split())[:100]  # numpy's span lines
+        raise OutputError(f"{path} is damaged ({reason}): remove it and run again") from error

@@ -1,0 +1,62 @@
+"""Files: whole or not there; damaged ones refused by name."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firenet_jax.files import OutputError, read_arrays, write_arrays, write_text
+
+
+def test_what_was_written_is_read(tmp_path):
+    write_arrays(tmp_path / "a.npz", x=np.arange(5), name=np.array("é"))
+    write_text(tmp_path / "a.txt", "é\n")
+    found = read_arrays(tmp_path / "a.npz")
+    assert found["x"].tolist() == [0, 1, 2, 3, 4] and str(found["name"]) == "é"
+    assert (tmp_path / "a.txt").read_bytes() == "é\n".encode()
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_killed_while_writing_the_old_text_stays(tmp_path, monkeypatch):
+    path, write = tmp_path / "a.txt", Path.write_text
+    write_text(path, "old")
+
+    def killed(path, text, **how):
+        write(path, text[:1], **how)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "write_text", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_text(path, "new")
+    assert path.read_text() == "old"
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path):
+    for write in (lambda path: write_text(path, "new"), lambda path: write_arrays(path, x=1)):
+        with pytest.raises(OutputError, match="gone/a.npz: cannot write"):
+            write(tmp_path / "gone" / "a.npz")
+
+
+def test_damaged_arrays_are_named_whatever_is_wrong_with_them(tmp_path):
+    path, rng = tmp_path / "a.npz", np.random.default_rng(0)
+    np.savez(path, x=np.arange(100))
+    whole, kinds = path.read_bytes(), set()
+    for trial in range(300):
+        damaged = bytearray(whole)
+        if trial % 2:
+            damaged = damaged[: rng.integers(len(whole))]
+        else:  # in the archive's and the array's headers
+            damaged[rng.choice([rng.integers(130), -1 - rng.integers(100)])] ^= 0xFF
+        path.write_bytes(damaged)
+        try:
+            read_arrays(path)
+        except OutputError as error:
+            assert "a.npz is damaged" in str(error) and "\n" not in str(error)
+            kinds.add(type(error.__cause__).__name__)
+    assert {"BadZipFile", "EOFError", "ValueError"} <= kinds
+
+
+def test_arrays_that_would_run_code_are_refused(tmp_path):
+    np.savez(tmp_path / "a.npz", x=np.array([print], object))
+    with pytest.raises(OutputError, match="damaged"):
+        read_arrays(tmp_path / "a.npz")
