@@ -4,6 +4,7 @@ Expected events are the arrays below, or bits put together by hand from the form
 """
 
 import builtins
+import contextlib
 import gzip
 import importlib.util
 import io
@@ -220,6 +221,11 @@ def test_damaged_compressed_text(tmp_path):
     crc = struct.pack("<I", zipfile.crc32(content.encode()))
     assert whole.count(crc) == 2  # before the data and in the list at the end
     refused(write(tmp_path / "crc.zip", whole.replace(crc, b"\0" * 4)), "Bad CRC-32")
+    for place in range(whole.index(b"PK\x01\x02"), len(whole)):  # the list of what is in it
+        for byte in (0, whole[place] ^ 0xFF):
+            path = write(tmp_path / "list.zip", whole[:place] + bytes([byte]) + whole[place + 1 :])
+            with contextlib.suppress(RecordingError):
+                events_of(path, (240, 320))
     packed = gzip.compress(content.encode())
     refused(write(tmp_path / "cut.txt.gz", packed[: len(packed) // 2]), "cannot be read")
     with zipfile.ZipFile(tmp_path / "two.zip", "w") as archive:

@@ -31,6 +31,7 @@ from firenet_jax.readers import REACH, Source, reading, to_events
 BLOCK = 1 << 21  # bytes parsed at once: about 90,000 events
 HEAD = 1 << 16  # bytes from which the layout is told
 SNIFFED = 1000  # rows from which the units are told
+BROKEN = zipfile.BadZipFile, zlib.error, EOFError, OSError  # what damaged compressed bytes raise
 
 NAMES = {
     "t": ("t", "ts", "time", "timestamp", "timestamps", "t_us", "timestamp_us"),
@@ -78,12 +79,12 @@ def read(path: Path, member: str | None = None) -> Source:
 @contextmanager
 def opened(path: Path, member: str | None = None) -> Iterator[BinaryIO]:
     """A file, or a file in a zip -> stream of its bytes; damage raises RecordingError."""
-    broken = (zipfile.BadZipFile, zlib.error, EOFError, gzip.BadGzipFile)
-    # RuntimeError: an encrypted member, or (its subclass) an unknown compression.
-    with reading(path, *broken, RuntimeError), ExitStack() as stack:
+    with reading(path, *BROKEN), ExitStack() as stack:
         if member is not None:
-            archive = stack.enter_context(zipfile.ZipFile(path))
-            yield stack.enter_context(archive.open(member))
+            with reading(path, Exception):  # a damaged list of members raises every kind
+                archive = stack.enter_context(zipfile.ZipFile(path))
+                stream = stack.enter_context(archive.open(member))
+            yield stream
         elif path.suffix.lower() == ".gz":
             yield stack.enter_context(gzip.open(path))
         else:
@@ -92,7 +93,7 @@ def opened(path: Path, member: str | None = None) -> Iterator[BinaryIO]:
 
 def members(path: Path) -> list[str]:
     """The names of the files in a zip."""
-    with reading(path, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+    with reading(path, Exception), zipfile.ZipFile(path) as archive:
         names = [info.filename for info in archive.infolist() if not info.is_dir()]
     return [name for name in names if not name.startswith("__MACOSX/")]
 
