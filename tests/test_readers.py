@@ -453,6 +453,33 @@ def test_wrong_hdf5(tmp_path):
 RESOLUTION = '{"sensor_resolution": [240, 320]}'
 
 
+@pytest.mark.parametrize("name", ["events", "events/xs", "images", "images/image000000000"])
+@pytest.mark.parametrize("kind", ["group", "number"])
+def test_cnn_with_something_else_under_a_known_name(tmp_path, name, kind):
+    path = write_cnn(tmp_path / "a.h5", size=None)
+    with h5py.File(path, "a") as file:
+        del file[name]
+        file.create_group(name) if kind == "group" else file.create_dataset(name, data=7)
+    if (name, kind) == ("images", "group"):
+        assert open_recording(path, (240, 320)).frames is None
+    else:
+        refused(path)
+
+
+@pytest.mark.parametrize("size", ["240x180", [180], [180, np.nan]])
+def test_cnn_with_a_strange_sensor_size(tmp_path, size):
+    path = write_cnn(tmp_path / "a.h5", size=None)
+    with h5py.File(path, "a") as file:
+        file.attrs["sensor_resolution"] = size
+    refused(path)
+
+
+def test_hdf5_with_names_that_are_no_text(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file[b"\xff\xfe"] = 1
+    refused(tmp_path / "a.h5", "expected the columns")
+
+
 def write_npy(folder: Path, names, t=T / 1e6, p=P, metadata=RESOLUTION) -> Path:
     folder.mkdir(exist_ok=True)
     xy = np.stack([X, Y], 1).astype(np.int16)

@@ -40,16 +40,18 @@ def read(path: Path) -> Source:
         _, count = _reader(path, file, layout)
         frames = _frames(path, file, layout)
         size = file.attrs.get("sensor_resolution")
-    if size is not None:
-        size = tuple(int(side) for side in np.ravel(size)[:2])
-    elif frames is not None:
+        if size is not None:
+            height, width = np.ravel(size)[:2]
+            size = int(height), int(width)
+    if size is None and frames is not None:
         size = frames.read(0).shape
     return Source(f"HDF5 ({layout})", lambda: _events(path, layout), size, count, frames)
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[h5py.File]:
-    with reading(path, OSError, RuntimeError, KeyError), h5py.File(path, "r") as file:
+    # Damaged bytes, and groups or text where numbers are expected, raise every kind.
+    with reading(path, Exception), h5py.File(path, "r") as file:
         yield file
 
 
@@ -61,7 +63,7 @@ def _layout(path: Path, file: h5py.File) -> str:
                 return layout
     if f"{MVSEC}/events" in file:
         return "MVSEC"
-    found = [*file]
+    found = list(map(str, file))  # names that are no text are bytes
     if isinstance(events, h5py.Group):
         found += [f"events/{name}" for name in events]
     raise RecordingError(
