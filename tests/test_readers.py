@@ -502,6 +502,9 @@ def test_npy(tmp_path, names):
     check_frames(path, [0, 100_000])
     assert open_recording(path).count == 5
     check(write_npy(tmp_path, names, t=T[:, None], p=P[:, None], metadata=None))
+    np.save(tmp_path / "images.npy", np.zeros((0, 240, 320), np.uint8))
+    np.save(tmp_path / names[4], np.zeros(0))
+    assert open_recording(path, (240, 320)).frames is None
     (tmp_path / "images.npy").unlink()
     assert open_recording(path, (240, 320)).frames is None
 
@@ -519,6 +522,24 @@ def test_wrong_npy(tmp_path):
     np.save(folder / "t.npy", T)
     np.save(folder / "timestamps.npy", np.array([0.1]))
     refused(folder, "has 2 frames in images.npy, but 1 times")
+    for name, array in [("timestamps", np.array(["0", "1"])), ("images", np.float32(1))]:
+        folder = write_npy(tmp_path / name, MEMMAP)
+        np.save(folder / f"{name}.npy", array)
+        refused(folder, f"{name}.npy")
+    folder = write_npy(tmp_path / "e", EVREAL, metadata="[]")
+    refused(folder, "metadata.json: cannot be read", size=None)
+
+
+def test_npy_with_a_damaged_header(tmp_path):
+    folder = write_npy(tmp_path / "a", MEMMAP)
+    for path in (folder / "t.npy", folder / "timestamps.npy"):
+        whole = path.read_bytes()
+        for place in range(128):
+            for byte in (ord("{"), whole[place] ^ 0xFF):
+                path.write_bytes(whole[:place] + bytes([byte]) + whole[place + 1 :])
+                with contextlib.suppress(RecordingError):
+                    events_of(folder, (240, 320))
+        path.write_bytes(whole)
 
 
 # ---------------------------------------------------------------- N-Caltech101

@@ -46,7 +46,7 @@ def _layout(path: Path) -> str | None:
 
 
 def _mapped(path: Path) -> np.ndarray:
-    with reading(path, OSError, ValueError, EOFError):
+    with reading(path, Exception):  # a damaged header raises every kind
         return np.load(path, mmap_mode="r", allow_pickle=False)
 
 
@@ -74,8 +74,13 @@ def _frames(path: Path, layout: str) -> Frames | None:
     files = path / "images.npy", path / FILES[layout][3]
     if not all(file.is_file() for file in files):
         return None
-    count, times = len(_mapped(files[0])), _mapped(files[1])
-    times = np.array(times).reshape(-1)
+    images, times = _mapped(files[0]), np.array(_mapped(files[1])).reshape(-1)
+    if not images.ndim or times.dtype.kind not in "iuf":
+        raise RecordingError(
+            f"{files[0]} has the shape {images.shape}, {files[1]} is {times.dtype}: expected "
+            "pictures and numbers"
+        )
+    count = len(images)
     if len(times) != count:
         raise RecordingError(f"{path}: has {count} frames in images.npy, but {len(times)} times")
     if not np.isfinite(times).all():
@@ -89,6 +94,6 @@ def _size(path: Path) -> tuple[int, int] | None:
     path = path / "metadata.json"
     if not path.is_file():
         return None
-    with reading(path, OSError, ValueError, TypeError):
+    with reading(path, Exception):
         resolution = json.loads(path.read_bytes()).get("sensor_resolution")
         return None if resolution is None else (int(resolution[0]), int(resolution[1]))
