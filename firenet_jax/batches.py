@@ -14,7 +14,6 @@ is the run that was not interrupted. Threads read ahead; events become tensors o
 import hashlib
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -27,7 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.events import Events, RecordingError, checked, event_number, logger
-from firenet_jax.readers import CHUNK, microseconds, reading, to_events, to_frame
+from firenet_jax.readers import CHUNK, microseconds, to_events, to_frame
+from firenet_jax.readers.hdf5 import opened
 from firenet_jax.sensor import Simulation
 from firenet_jax.tensors import BINS, Packed, pack, voxelise
 from firenet_jax.warp import warp
@@ -129,14 +129,8 @@ class Index(NamedTuple):
     rows: np.ndarray  # (F,) int64, events before each image
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[h5py.File]:
-    with reading(path, OSError, RuntimeError, KeyError), h5py.File(path, "r") as file:
-        yield file
-
-
 def _facts(path: Path) -> Facts:
-    with _opened(path) as file:
+    with opened(path) as file:
         images = file.get("images", {})
         count = len(images)
         if count < 2:
@@ -157,7 +151,7 @@ def _facts(path: Path) -> Facts:
 
 
 def _index(path: Path) -> Index:
-    with _opened(path) as file:
+    with opened(path) as file:
         images, stamps = file["images"], file["events/ts"]
         names = list(images)  # sorted by HDF5
         times = np.array([images[name].attrs["timestamp"] for name in names])
@@ -225,7 +219,7 @@ def _example(
     sign = np.array([-1 if across else 1, -1 if down else 1], np.float32)
     shape = facts.height, facts.width
     images, displacements = {}, {}
-    with _opened(facts.path) as file:
+    with opened(facts.path) as file:
         rows = slice(*index.rows[[starts[0], ends[-1]]])
         events = _cropped(_read_events(file, facts, rows), top, left, crop, down, across)
         for end in np.unique(ends):

@@ -47,7 +47,8 @@ from firenet_jax.files import OutputError, read_arrays, write_arrays, write_text
 from firenet_jax.filters import between
 from firenet_jax.methods import Method, Missing, digest, load
 from firenet_jax.overlap import ahead
-from firenet_jax.readers import FORMATS, open_recording, reading
+from firenet_jax.readers import FORMATS, open_recording
+from firenet_jax.readers.hdf5 import opened
 from firenet_jax.report import METRICS
 from firenet_jax.video import write_video
 from firenet_jax.windows import Window, Windows, cut
@@ -332,7 +333,7 @@ def read_flow(plan: Plan, place: int) -> np.ndarray | None:
     path, number = plan.recording.path, int(plan.numbers[place])
     if place == 0 or number != plan.numbers[place - 1] + 1 or not h5py.is_hdf5(path):
         return None
-    with reading(path, OSError, RuntimeError, KeyError), h5py.File(path, "r") as file:
+    with opened(path) as file:
         names = sorted(file.get("images", ()))
         name = names[number].replace("image", "flow") if names else ""
         if name not in file.get("flow", ()):

@@ -327,10 +327,19 @@ def test_files_that_cannot_be_used_are_said(tmp_path, noise):
     assert "cannot be read" in refused(tmp_path / "missing.h5")
 
 
+def instead(file: h5py.File, name: str):
+    """A type where an array or a group is expected."""
+    del file[name]
+    file[name] = np.dtype("f8")
+
+
 @pytest.mark.parametrize(
     "damage, expected",
     [
         (lambda f: f.__delitem__("events/xs"), "cannot be read"),
+        (lambda f: instead(f, "images"), "cannot be read"),
+        (lambda f: instead(f, "images/image000000000"), "cannot be read"),
+        (lambda f: instead(f, "events/ts"), "cannot be read"),
         (lambda f: f["events/xs"].write_direct(np.full(4000, 99, np.int16)), "x is 99, outside"),
         (lambda f: f["events/ts"].write_direct(f["events/ts"][:][::-1].copy()), "runs backwards"),
         (lambda f: f["images/image000000003"].attrs.update(timestamp=0.0), "image 3: its time"),

@@ -35,7 +35,7 @@ def matches(path: Path) -> bool:
 
 
 def read(path: Path) -> Source:
-    with _opened(path) as file:
+    with opened(path) as file:
         layout = _layout(path, file)
         _, count = _reader(path, file, layout)
         frames = _frames(path, file, layout)
@@ -49,8 +49,9 @@ def read(path: Path) -> Source:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[h5py.File]:
-    # Damaged bytes, and groups or text where numbers are expected, raise every kind.
+def opened(path: Path) -> Iterator[h5py.File]:
+    """Whatever goes wrong with the file raises RecordingError: damaged bytes, and groups or text
+    where numbers are expected, raise every kind."""
     with reading(path, Exception), h5py.File(path, "r") as file:
         yield file
 
@@ -114,7 +115,7 @@ def _check_filters(path: Path, data: h5py.Dataset):
 
 
 def _events(path: Path, layout: str) -> Iterator[Events]:
-    with _opened(path) as file:
+    with opened(path) as file:
         yield from in_chunks(*_reader(path, file, layout))
 
 
@@ -139,5 +140,5 @@ def _times(path: Path, times: np.ndarray) -> np.ndarray:
 
 
 def _frame(path: Path, name: str, index) -> np.ndarray:
-    with _opened(path) as file:
+    with opened(path) as file:
         return to_frame(file[name][index], path)
