@@ -1,7 +1,7 @@
 """firenet_jax: recordings of event cameras become video, by FireNet as pure JAX functions.
 
     reconstruct   readers -> events -> windows -> tensors -> network (scan) -> pictures -> video
-    train         scenes -> sensor -> (dataset) -> train (losses) -> weights
+    train         textures -> scenes -> sensor -> (dataset) -> train (losses) -> weights
 
     import firenet_jax as fj
 

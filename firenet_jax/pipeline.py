@@ -458,9 +458,14 @@ def load_position(job: Job, settings: Reconstruct) -> tuple[int, Session]:
         return 0, initial
     saved = read_arrays(path)
     if str(saved.get("record")) == job.record:
-        done, tree = int(saved["pictures"]), jax.tree.structure(initial)
+        tree = jax.tree.structure(initial)
+        try:
+            done = int(saved["pictures"])
+            session = tree.unflatten([saved[f"state{i}"] for i in range(tree.num_leaves)])
+        except KeyError as error:  # of another version of this program
+            raise OutputError(f"{path} lacks {error}: remove it and run again") from error
         logger.warning("%s: going on after %d pictures", job.output, done)
-        return done, tree.unflatten(saved[f"state{i}"] for i in range(tree.num_leaves))
+        return done, session
     if not settings.overwrite:
         raise OutputError(
             f"{path.parent} holds an unfinished run of other settings or another recording: "

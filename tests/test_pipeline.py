@@ -12,7 +12,7 @@ from processes import finish, start, together
 from firenet_jax import pipeline
 from firenet_jax.checkpoint import save_weights
 from firenet_jax.events import RecordingError
-from firenet_jax.files import OutputError
+from firenet_jax.files import OutputError, read_arrays
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pictures import Display
 from firenet_jax.pipeline import Reconstruct, run
@@ -132,6 +132,15 @@ def interrupt_after(monkeypatch, pictures):
     monkeypatch.setattr(FolderWriter, "write", write)
 
 
+def unfinished(weights, recording, output, monkeypatch):
+    """A run that was interrupted after nine pictures."""
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "RESUME_EVERY", 0)
+        interrupt_after(patch, 9)
+        with pytest.raises(Interrupted):
+            run(settings(weights, (recording,), output))
+
+
 @pytest.mark.parametrize("at", [2, 9, 30])
 def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, weights, monkeypatch, at):
     recording = write_recording(tmp_path / "a.txt", 3050)
@@ -160,11 +169,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, weights, monkey
 
 def test_other_settings_do_not_continue_an_unfinished_run(tmp_path, weights, monkeypatch):
     recording = write_recording(tmp_path / "a.txt")
-    with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "RESUME_EVERY", 0)
-        interrupt_after(patch, 9)
-        with pytest.raises(Interrupted):
-            run(settings(weights, (recording,), tmp_path / "out"))
+    unfinished(weights, recording, tmp_path / "out", monkeypatch)
     other = {"windows": Windows(events=200)}
     with pytest.raises(ValueError, match="unfinished run of other settings"):
         run(settings(weights, (recording,), tmp_path / "out", **other))
@@ -174,15 +179,16 @@ def test_other_settings_do_not_continue_an_unfinished_run(tmp_path, weights, mon
 
 def test_what_an_interrupted_run_left_is_named_where_it_is_damaged(tmp_path, weights, monkeypatch):
     recording = write_recording(tmp_path / "a.txt")
-    with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "RESUME_EVERY", 0)
-        interrupt_after(patch, 9)
-        with pytest.raises(Interrupted):
-            run(settings(weights, (recording,), tmp_path / "out"))
+    unfinished(weights, recording, tmp_path / "out", monkeypatch)
     kept = tmp_path / "out.partial" / "resume.npz"
+    whole = read_arrays(kept)
     kept.write_bytes(kept.read_bytes()[:-100])
     with pytest.raises(OutputError, match="resume.npz is damaged .*: remove it"):
         run(settings(weights, (recording,), tmp_path / "out"))
+    for name in ("pictures", "state0"):
+        np.savez(kept, **{key: value for key, value in whole.items() if key != name})
+        with pytest.raises(OutputError, match=f"resume.npz lacks '{name}': remove it"):
+            run(settings(weights, (recording,), tmp_path / "out"))
     kept.unlink()
     run(settings(weights, (recording,), tmp_path / "out"))
     assert len(pictures_of(tmp_path / "out")[0]) == 30
