@@ -40,7 +40,7 @@ class Packed(NamedTuple):
     x: np.ndarray  # (E,) int16
     y: np.ndarray  # (E,) int16
     p: np.ndarray  # (E,) bool
-    end: np.ndarray  # (T, B) int32, the place after each window's last event
+    window: np.ndarray  # (E,) int16, t B + b; T B for unused places
     t_min: np.ndarray  # (T, B) int32, microseconds modulo 2^32
     duration: np.ndarray  # (T, B) float32, microseconds, at least 1
 
@@ -70,19 +70,25 @@ def pack(
     size = capacity(counts.sum()) if size is None else size
     if counts.sum() > size:
         raise ValueError(f"{counts.sum()} events do not fit into a list of {size}")
+    if len(flat) >= 2**15:
+        raise ValueError(f"{shape} windows are too many for one chunk")
     if bounds is None:
         bounds = np.array([(w.t[0], w.t[-1]) if len(w) else (0, 0) for w in flat], np.int64)
     t_min, t_max = np.asarray(bounds, np.int64).reshape(-1, 2).T
 
+    t, x, y, p, window = _columns(size, (np.int32, np.int16, np.int16, bool, np.int16))
     packed = Packed(
-        *_columns(size, (np.int32, np.int16, np.int16, bool)),
-        end=np.cumsum(counts, dtype=np.int32).reshape(shape),
+        t,
+        x,
+        y,
+        p,
+        window,
         t_min=t_min.astype(np.int32).reshape(shape),
         duration=np.maximum(t_max - t_min, 1).astype(np.float32).reshape(shape),
     )
+    start = 0
     for number, window in enumerate(flat):
-        stop = packed.end.flat[number]
-        start = stop - len(window)
+        stop = start + len(window)
         times, span = window.t, int(t_max[number] - t_min[number])
         if span >= 2**31:
             # The device subtracts modulo 2^32, which is exact below 36 minutes. A longer window
@@ -95,11 +101,14 @@ def pack(
         packed.x[start:stop] = window.x
         packed.y[start:stop] = window.y
         packed.p[start:stop] = window.p
+        packed.window[start:stop] = number
+        start = stop
+    packed.window[start:] = len(flat)
     return packed
 
 
 # How the devices of `pack_for_devices` share its arrays.
-IN_LISTS = Packed(*[BATCH] * 4, end=TIME_BATCH, t_min=TIME_BATCH, duration=TIME_BATCH)
+IN_LISTS = Packed(*[BATCH] * 5, t_min=TIME_BATCH, duration=TIME_BATCH)
 
 
 def pack_for_devices(
@@ -115,7 +124,7 @@ def pack_for_devices(
     lists = [pack(part, capacity(events, at_least)) for part in parts]
     if devices == 1:
         return lists[0]
-    along = {"end": 1, "t_min": 1, "duration": 1}
+    along = {"t_min": 1, "duration": 1}
     columns = zip(Packed._fields, zip(*lists, strict=True), strict=True)
     return Packed(*(np.concatenate(column, along.get(name, 0)) for name, column in columns))
 
@@ -152,12 +161,10 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
         )
     places = BINS * windows * plane
 
-    def vote(planes, block):
-        first, t, x, y, p = block
-        # Unused places come after all ends: they get the number of windows, and no vote.
-        number = first + jnp.arange(len(t))
-        window = jnp.searchsorted(packed.end.ravel(), number, side="right", method="compare_all")
-        x, y = x.astype(jnp.int32), y.astype(jnp.int32)
+    def vote(planes, columns):
+        t, x, y, p, window = columns
+        # Indices of unused places reach past the end of t_min; they are clamped and dropped later.
+        window, x, y = (column.astype(jnp.int32) for column in (window, x, y))
         since = t - packed.t_min.ravel()[window]  # int32: exact, modulo 2^32
         t_star = (BINS - 1) * since.astype(jnp.float32) / packed.duration.ravel()[window]
         seen = (0 <= x) & (x < width) & (0 <= y) & (y < height) & (window < windows)
@@ -178,8 +185,8 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
     # fifth faster for a million events. Accelerators take the list as one block.
     size = packed.t.shape[0]
     block = BLOCK if jax.default_backend() == "cpu" and size % BLOCK == 0 else size
-    columns = [column.reshape(-1, block) for column in packed[:4]]
-    planes, _ = jax.lax.scan(vote, jnp.zeros(places), (jnp.arange(0, size, block), *columns))
+    columns = jax.tree.map(lambda column: column.reshape(-1, block), packed[:5])
+    planes, _ = jax.lax.scan(vote, jnp.zeros(places), columns)
     return planes.reshape(BINS, steps, batch, height, width).transpose(1, 2, 3, 4, 0)
 
 
