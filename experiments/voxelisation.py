@@ -6,7 +6,7 @@ index_add_), and the leanest index_add_ we could write. Expected: ours at least 
 the former and 20 times faster than numpy.add.at, in the median of 20 runs. That is measured several
 times, because it moves by a third on a machine that is shared.
 
-    python experiments/voxelisation.py            4 minutes; needs torch
+    python experiments/voxelisation.py            3 minutes; needs torch
 """
 
 import argparse
