@@ -37,7 +37,13 @@ from firenet_jax.events import Events, concatenate, parse_size
 from firenet_jax.files import OutputError, partial_name, write_text, writing
 from firenet_jax.overlap import ahead
 from firenet_jax.scenes import Scene, SceneSettings, flow, random_scene, rendering_times, video
-from firenet_jax.sensor import FAULTY, LONGEST, SensorSettings, event_list, random_sensor
+from firenet_jax.sensor import (
+    LONGEST,
+    SensorSettings,
+    event_list,
+    random_sensor,
+    with_faults,
+)
 from firenet_jax.textures import load_textures
 
 ROWS = 1 << 16  # events in a chunk of the file, and so many are written at once
@@ -84,7 +90,7 @@ class Simulate:
     linearly, and there is no optical flow."""
     faults: bool = False
     """What real sensors have: mismatch, noise, leak, hot pixels, finite bandwidth; options below
-    that are given stay as given."""
+    that are given stay as given (--noise 0 0: all but noise)."""
     overwrite: bool = False
     """With --video: replace an output that exists."""
     scene: SceneSettings = SceneSettings()
@@ -339,17 +345,6 @@ def rounded_flow(velocity: np.ndarray) -> np.ndarray:
     step = 2.0 ** (math.ceil(math.log2(peak)) - FLOW_BITS)
     # + 0.0 turns -0 into 0, which compresses better
     return (np.round(velocity / np.float32(step)) * np.float32(step) + 0.0).astype(np.float32)
-
-
-def with_faults(sensor: SensorSettings) -> SensorSettings:
-    """FAULTY, except where these settings differ from the plain ones."""
-    plain = SensorSettings()
-    chosen = {
-        field.name: getattr(sensor, field.name)
-        for field in dataclasses.fields(sensor)
-        if getattr(sensor, field.name) != getattr(plain, field.name)
-    }
-    return dataclasses.replace(FAULTY, **chosen)
 
 
 # ---- Folders

@@ -43,7 +43,7 @@ from firenet_jax.comparison import (
 )
 from firenet_jax.equalise import Kind, equalise
 from firenet_jax.events import Frames, Recording, RecordingError, logger, parse_size
-from firenet_jax.files import OutputError, read_arrays, write_arrays, write_text
+from firenet_jax.files import OutputError, identity, read_arrays, write_arrays, write_text
 from firenet_jax.filters import between
 from firenet_jax.methods import Method, Missing, digest, load
 from firenet_jax.overlap import ahead
@@ -138,6 +138,10 @@ class Evaluate:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise ValueError(f"{name} is {value}, but must be 0 or more")
+        for name in ("start", "stop"):
+            value = getattr(self, name)
+            if value is not None and not math.isfinite(value):
+                raise ValueError(f"{name} is {value} s, but must be a time: leave it out for none")
         if self.stop is not None and self.stop <= (self.start or 0):
             raise ValueError(f"stop is {self.stop} s, but must come after the start")
         parse_size(self.sensor_size)
@@ -409,9 +413,7 @@ def describe(settings: Evaluate, learned: lpips.Lpips | None) -> dict:
 
 
 def describe_one(shared: dict, recording: Recording, method: Method) -> dict:
-    status = recording.path.stat()
-    identity = [recording.path.name, status.st_size, status.st_mtime_ns]
-    return shared | {"recording": identity, **method.record}
+    return shared | {"recording": identity(recording.path), **method.record}
 
 
 def result_file(settings: Evaluate, sequence: str, method: str) -> Path:
@@ -550,7 +552,7 @@ def protocol(settings: Evaluate) -> list[str]:
         f"{windows}; warm-up of up to {settings.warm_up:g} s; predictions within "
         f"{settings.tolerance:g} ms of a frame count",
         f"histogram equalisation before metrics: {settings.equalise} (temporal error: none); "
-        "images clipped to 0 to 1",
+        "images clipped to 0 to 1, E2VID's stretched before (1st to 99th percentile)",
         "SSIM: Gaussian window of 11x11 pixels, sigma 1.5, population covariance, data range 1, "
         "without the border; PSNR in dB for a range of 1",
         "temporal error: mean M |I_k - W(I_k-1)|, warped by the data's optical flow; Features: "

@@ -19,6 +19,18 @@ def partial_name(path: Path) -> Path:
     return path.with_name(f"{path.stem}.partial{path.suffix}")
 
 
+def identity(path: Path) -> list:
+    """[name, bytes, time of the last change in ns]: other content shows in it, ready for JSON.
+
+    Of a folder these are those of the files in it and in its `images`: its own time stands still
+    when one of them is written anew. What is in other folders in it may be output.
+    """
+    kept = [path] if path.is_file() else [*path.iterdir(), *path.glob("images/*")]
+    states = [file.stat() for file in kept if file.is_file()]
+    changed = max((state.st_mtime_ns for state in states), default=0)
+    return [path.name, sum(state.st_size for state in states), changed]
+
+
 @contextlib.contextmanager
 def writing(path: Path):
     """Full disks and the like, said with the name of the output."""

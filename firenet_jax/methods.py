@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.baselines import e2vid, high_pass, manifold
@@ -111,7 +112,11 @@ def firenet(name: str, weights: Weights) -> Method:
 
 
 def recurrent_unet(name: str, params, settings: e2vid.Settings = e2vid.Settings()) -> Method:
-    """E2VID and E2VID+."""
+    """E2VID and E2VID+ (no sigmoid), each as EVREAL runs it.
+
+    E2VID takes normalised tensors, and its images are stretched, so that their 1st percentile
+    becomes 0 and their 99th 1; E2VID+ takes tensors as they are and its images stay so.
+    """
     params = jax.device_put(params)
 
     def initial(height, width):
@@ -122,14 +127,19 @@ def recurrent_unet(name: str, params, settings: e2vid.Settings = e2vid.Settings(
         network, image = _unet_step(params, state.network, tensor, settings)
         return state._replace(network=network), image
 
-    record = {"method": "e2vid", "weights": digest(params), **dataclasses.asdict(settings)}
-    return Method(name, initial, step, record)
+    as_published = {"normalise": settings.sigmoid, "stretched": settings.sigmoid}
+    record = {"method": "e2vid", **as_published, **dataclasses.asdict(settings)}
+    return Method(name, initial, step, record | {"weights": digest(params)})
 
 
 @partial(jax.jit, static_argnames="settings")
 def _unet_step(params, state, tensor, settings):
+    if not settings.sigmoid:
+        state, images = e2vid.step(params, state, tensor[0], settings)
+        return state, images[0]
     state, images = e2vid.step(params, state, normalise(tensor[0]), settings)
-    return state, images[0]
+    low, high = jnp.percentile(images[0], jnp.array([1.0, 99.0]))
+    return state, (images[0] - low) / jnp.where(high > low, high - low, 1.0)
 
 
 def filtered(name: str, settings: high_pass.HighPass = high_pass.HighPass()) -> Method:

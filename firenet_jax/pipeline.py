@@ -28,7 +28,7 @@ from firenet_jax import filters
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.devices import BATCH, EVERYWHERE, check_processes, in_a_row, join, shared
 from firenet_jax.events import Events, Recording, RecordingError, logger, parse_size
-from firenet_jax.files import OutputError, partial_name, read_arrays, writing
+from firenet_jax.files import OutputError, identity, partial_name, read_arrays, writing
 from firenet_jax.network import Weights
 from firenet_jax.overlap import ahead
 from firenet_jax.pictures import Display
@@ -405,13 +405,12 @@ def describe(settings: Reconstruct, recording: Recording, weights: Weights) -> s
     digest = hashlib.sha256(str(weights.normalise).encode())
     for path, leaf in jax.tree_util.tree_leaves_with_path(weights.params):
         digest.update(jax.tree_util.keystr(path).encode() + np.asarray(leaf).tobytes())
-    status = recording.path.stat()
     choices = dataclasses.asdict(settings)
     for name in ELSEWHERE:
         del choices[name]
     return json.dumps(
         {
-            "recording": [recording.path.name, status.st_size, status.st_mtime_ns],
+            "recording": identity(recording.path),
             "sensor": [recording.height, recording.width],
             "weights": digest.hexdigest(),
             **choices,

@@ -31,9 +31,22 @@ MARGIN = 1.3  # the outline's field reaches so many radii from the centre
 BLUR = 4  # pixels of the blurring kernel on each side of its middle
 
 
+def check_range(name: str, bounds: tuple[float, float]) -> None:
+    """Raises ValueError unless a number can be drawn log-uniformly between these."""
+    least, greatest = bounds
+    if not (0 < least <= greatest and math.isfinite(greatest)):
+        raise ValueError(
+            f"{name} is {least:g} {greatest:g}, but is drawn log-uniformly: "
+            "both must be more than 0, the least first"
+        )
+
+
 @dataclass(frozen=True)
 class SceneSettings:
-    """What random scenes look like. Pairs are (least, greatest)."""
+    """What random scenes look like. Pairs are (least, greatest).
+
+    Raises ValueError for numbers that no scene has.
+    """
 
     objects: int = 3
     """Objects before the background; a scene shows between none and all of them."""
@@ -64,6 +77,24 @@ class SceneSettings:
     """Exponent applied to a texture's values, drawn log-uniformly."""
     hdr: float = 0.0
     """How probable it is that a scene lies partly in deep shadow, 10 to 100 times darker."""
+
+    def __post_init__(self):
+        for name in ("speed", "zoom", "size", "softness", "gamma"):
+            check_range(name, getattr(self, name))
+        for name in ("pause", "still", "plain", "hdr"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}, but is a probability, 0 to 1")
+        if self.objects < 0:
+            raise ValueError(f"objects is {self.objects}, but must be 0 or more")
+        if not 0 <= self.tilt <= 1:
+            raise ValueError(f"tilt is {self.tilt} radians, but must be between 0 and 1")
+        for name in ("black", "white"):
+            least, greatest = getattr(self, name)
+            if not 0 <= least <= greatest <= 1:
+                raise ValueError(
+                    f"{name} is {least:g} {greatest:g}, but both are intensities, 0 to 1, "
+                    "the least first"
+                )
 
 
 class Motion(NamedTuple):

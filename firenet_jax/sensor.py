@@ -18,6 +18,7 @@ Images are (H, W) float32 in [0, 1]; sensors, states and runs are of one sequenc
 makes batches of them.
 """
 
+import dataclasses
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.events import Events, concatenate
-from firenet_jax.scenes import Scene, SceneSettings, flow, random_scene, render
+from firenet_jax.scenes import Scene, SceneSettings, check_range, flow, random_scene, render
 from firenet_jax.tensors import BINS
 
 EPS = 0.001
@@ -38,10 +39,21 @@ AT_ONCE = 4  # events of a pixel in one pass over the picture: fewer passes, les
 LONGEST = 2**31 // TICKS - 1  # microseconds between two renderings
 
 
+FAULTS = "mismatch", "noise", "leak", "hot", "cutoff"
+
+
+def _on(fault: float | tuple[float, float] | None) -> bool:
+    return fault is not None and fault not in (0, (0, 0))
+
+
 @dataclass(frozen=True)
 class SensorSettings:
     """The sensor; as it stands the paper's, without faults. Pairs are (least, greatest), drawn
-    log-uniformly for each sequence; (0, 0) switches a fault off."""
+    log-uniformly for each sequence. A fault is off where it is 0, (0, 0) or None, which is 0 unless
+    all faults are asked for (`with_faults`).
+
+    Raises ValueError for numbers that no sensor has.
+    """
 
     threshold: float = 0.18
     """Mean of the contrast thresholds, in log intensity."""
@@ -56,18 +68,47 @@ class SensorSettings:
     """Seconds after an event in which a pixel stays silent."""
     refractory_range: tuple[float, float] | None = None
     """Draw it log-uniformly from here instead, once for a sequence."""
-    mismatch: float = 0.0
+    mismatch: float | None = None
     """Standard deviation of each pixel's own thresholds, in log intensity; about 0.03 in life."""
-    noise: tuple[float, float] = (0.0, 0.0)
-    """Shot noise: events per second and pixel, ON or OFF, at any time."""
-    leak: tuple[float, float] = (0.0, 0.0)
+    noise: tuple[float, float] | None = None
+    """Shot noise: events per second and pixel, ON or OFF, at any time; at most one of a pixel
+    between two renderings."""
+    leak: tuple[float, float] | None = None
     """ON events per second by which every pixel's reference drifts, about 0.1 in sensors."""
-    hot: tuple[float, float] = (0.0, 0.0)
+    hot: tuple[float, float] | None = None
     """Part of the pixels that are hot: 10 to 500 events per second, ON or OFF, without end."""
-    cutoff: tuple[float, float] = (0.0, 0.0)
+    cutoff: tuple[float, float] | None = None
     """Hertz: bandwidth of the pixels, a first-order low-pass on log intensity."""
     cutoff_dark: float = 0.1
     """Bandwidth in the dark, in parts of that in full light; 1: it depends on no light."""
+
+    def __post_init__(self):
+        for name in ("threshold_range", "refractory_range"):
+            if getattr(self, name) is not None:
+                check_range(name, getattr(self, name))
+        for name in FAULTS[1:]:
+            if _on(getattr(self, name)):
+                check_range(name, getattr(self, name))
+        if _on(self.hot) and self.hot[1] > 1:
+            raise ValueError(f"hot is {self.hot}, but is a part of the pixels: at most 1")
+        if not (self.threshold > 0 and math.isfinite(self.threshold)):
+            raise ValueError(f"threshold is {self.threshold}, but must be more than 0")
+        for name in ("threshold_spread", "asymmetry", "refractory", "mismatch", "cutoff_dark"):
+            value = getattr(self, name)
+            if value is not None and not (value >= 0 and math.isfinite(value)):
+                raise ValueError(f"{name} is {value}, but must be 0 or more")
+        # A range wins, so what is given beside it would silently do nothing.
+        for name, owner in (
+            ("threshold", "threshold_range"),
+            ("threshold_spread", "threshold_range"),
+            ("refractory", "refractory_range"),
+        ):
+            default = SensorSettings.__dataclass_fields__[name].default
+            if getattr(self, owner) is not None and getattr(self, name) != default:
+                raise ValueError(
+                    f"{name} plays no part beside {owner}: "
+                    f"pass --{owner.replace('_', '-')} None too"
+                )
 
 
 FAULTY = SensorSettings(
@@ -79,6 +120,19 @@ FAULTY = SensorSettings(
     cutoff=(100.0, 1000.0),
 )
 """Everything on, as much as real sensors show."""
+
+
+def with_faults(sensor: SensorSettings) -> SensorSettings:
+    """FAULTY, but with what these settings say about a fault, and otherwise about the sensor."""
+    plain = SensorSettings()
+    chosen = {
+        field.name: getattr(sensor, field.name)
+        for field in dataclasses.fields(sensor)
+        if getattr(sensor, field.name) != getattr(plain, field.name)
+    }
+    if "refractory" in chosen:
+        chosen.setdefault("refractory_range", None)
+    return dataclasses.replace(FAULTY, **chosen)
 
 
 class Sensor(NamedTuple):
@@ -135,18 +189,18 @@ def random_sensor(
     else:
         on = log_uniform(settings.threshold_range)
         off = on * (1 + settings.asymmetry * spread[0])
-    if settings.mismatch:
+    if _on(settings.mismatch):
         own = settings.mismatch * jax.random.normal(mismatch_key, (2, *shape))
         on, off = on + own[0], off + own[1]
     on, off = (jnp.maximum(threshold, 0.01) for threshold in (on, off))  # as in ESIM
 
     drift = phase = None
-    if settings.leak[1] or settings.hot[1]:
+    if _on(settings.leak) or _on(settings.hot):
         chance, sign, rate, phase = jax.random.uniform(drift_key, (4, *shape))
         drift = jnp.zeros(shape)
-        if settings.leak[1]:
+        if _on(settings.leak):
             drift += on * log_uniform(settings.leak)
-        if settings.hot[1]:
+        if _on(settings.hot):
             rate = 10.0 * 50.0**rate * jnp.where(sign < 0.5, on, -off)
             drift = jnp.where(chance < log_uniform(settings.hot), rate, drift)
     refractory = jnp.float32(settings.refractory) if settings.refractory else None
@@ -159,9 +213,9 @@ def random_sensor(
         if refractory is None
         else jnp.round(refractory * 1e6 * TICKS).astype(jnp.int32),
         drift=drift,
-        noise=log_uniform(settings.noise) if settings.noise[1] else None,
+        noise=log_uniform(settings.noise) if _on(settings.noise) else None,
         cutoff=jnp.stack([log_uniform(settings.cutoff), jnp.float32(settings.cutoff_dark)])
-        if settings.cutoff[1]
+        if _on(settings.cutoff)
         else None,
         phase=phase,
         key=noise_key,
@@ -255,7 +309,9 @@ def _shot_noise(key: jax.Array, expected: jax.Array, shape, ticks: jax.Array) ->
     Noise does not move the reference, nor does it wait for the refractory period. One random
     number decides all: where it is below the probability, it is uniform below it.
     """
-    chance = -jnp.expm1(-expected)  # at least one event of a Poisson process
+    # Not that of at least one event of a Poisson process, 1 - exp(-expected): as no interval has
+    # more than one, the rate that was asked for would be missed by a quarter at 0.6.
+    chance = jnp.minimum(expected, 1.0)
     number = jax.random.bits(key, shape, jnp.uint32).astype(jnp.float32) * 2.0**-32
     fires = number < chance
     place = 2 * number / jnp.where(chance > 0, chance, 1.0)  # [0, 2): polarity and time

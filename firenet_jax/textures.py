@@ -122,13 +122,26 @@ def _cutting(rng, path: Path, size: int) -> np.ndarray:
         least = min(max(size / min(picture.size), 0.4), 0.7)
         # lets JPEG decode at half or a quarter of its size
         picture.draft("L", (round(size / least), round(size / least)))
-        grey = picture.convert("L")
+        grey = _grey(picture)
     side = rng.uniform(least, 1.0) * min(grey.size)
     left, top = (rng.uniform(0, length - side) for length in grey.size)
     box = (left, top, left + side, top + side)
     grey = grey.resize((size, size), Image.Resampling.LANCZOS, box, reducing_gap=3.0)
     values = np.asarray(grey, np.float32) / 255
     return values[:, ::-1] if rng.random() < 0.5 else values
+
+
+def _grey(picture: Image.Image) -> Image.Image:
+    """The picture in 8 bits of grey; Pillow's own conversion clips more than 8 bits to white."""
+    if picture.mode == "F":
+        raise ValueError("it holds fractions, whose range is not known: save it as 8 or 16 bits")
+    if picture.mode.startswith("I"):
+        values = np.asarray(picture)
+        if values.min() < 0 or values.max() >= 2**16:
+            raise ValueError("its values are not those of 8 or 16 bits")
+        deep = picture.mode != "I" or values.max() > 255  # "I" is 32 bits, of which few are used
+        return Image.fromarray((values >> 8 if deep else values).astype(np.uint8))
+    return picture.convert("L")
 
 
 def _stretched(values: np.ndarray, rng) -> np.ndarray:

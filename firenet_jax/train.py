@@ -60,7 +60,7 @@ from firenet_jax.files import write_text
 from firenet_jax.losses import Loss, sequence_loss
 from firenet_jax.network import State, Weights, initial_params, initial_state, step
 from firenet_jax.pictures import event_pictures
-from firenet_jax.scenes import SceneSettings
+from firenet_jax.scenes import SceneSettings, check_range
 from firenet_jax.sensor import (
     FAULTY,
     SensorSettings,
@@ -75,6 +75,8 @@ from firenet_jax.textures import load_textures
 
 TEXTURE = 256  # pixels on a side of a texture
 VALIDATION = 8  # batches
+FREE = "log_every", "save_every", "validate_every"  # say nothing about what is computed
+SMALLEST = 11  # pixels on a side of what validation measures: SSIM's window
 
 
 @dataclass(frozen=True)
@@ -159,6 +161,8 @@ class Train:
             "renderings",
             "learning_rate",
             "clip",
+            "log_every",
+            "validate_every",
         )
         for name in positive:
             if not getattr(self, name) > 0:
@@ -168,8 +172,15 @@ class Train:
                 f"windows is {self.windows}, but the loss is over more than {self.loss.l0} and at "
                 f"most {self.loss.L + 1} of them"
             )
-        if self.warmup >= self.steps:
-            raise ValueError(f"warmup is {self.warmup} steps of {self.steps}: use fewer")
+        if self.crop < SMALLEST:
+            raise ValueError(
+                f"crop is {self.crop} pixels, but images smaller than {SMALLEST} cannot be judged"
+            )
+        check_range("motion", self.motion)
+        if not 0 <= self.procedural <= 1:
+            raise ValueError(f"procedural is {self.procedural}, but is a part of the textures, 0-1")
+        if not 0 <= self.warmup < self.steps:
+            raise ValueError(f"warmup is {self.warmup} steps of {self.steps}: use 0 or more, fewer")
         check_processes(self.coordinator, self.processes, self.process)
 
 
@@ -592,10 +603,23 @@ def _filled(found: dict, defaults: dict) -> dict:
     return defaults | found | inner
 
 
+def _differences(found: dict, now: dict) -> list[str]:
+    """What is said of each setting that differs, also within `loss`, `scene` and so on."""
+    said = []
+    for name in sorted({*found, *now} - set(FREE)):
+        was, is_now = found.get(name), now.get(name)
+        if isinstance(was, dict) and isinstance(is_now, dict):
+            said += [f"{name}.{inner}" for inner in _differences(was, is_now)]
+        elif was != is_now:
+            said.append(f"{name} was {was}, now {is_now}")
+    return said
+
+
 def _same_settings(folder: Path, settings: Train) -> None:
     """Keeps the settings in the folder; raises ValueError if a run of others is there.
 
     Options that the run there does not know, as it is older than they are, count as their defaults.
+    Those of `FREE` may change. Of a run that failed before its first step there is nothing to keep.
     """
     folder.mkdir(parents=True, exist_ok=True)
     text, defaults = _as_text(settings), json.loads(_as_text(Train(folder)))
@@ -605,7 +629,12 @@ def _same_settings(folder: Path, settings: Train) -> None:
             found = _filled(json.loads(path.read_text()), defaults)
         except (ValueError, AttributeError) as error:
             raise ValueError(f"{path} is damaged ({error}): choose another --output") from error
-        if found != json.loads(text):
-            raise ValueError(f"{folder} holds a run with other settings: choose another --output")
+        other = _differences(found, json.loads(text))
+        began = list(_entries(folder / "log.jsonl")) or any(folder.glob("checkpoints/[0-9]*"))
+        if other and (began or not _first()):
+            raise ValueError(
+                f"{folder} holds a run with other settings ({', '.join(other)}): choose another "
+                "--output, or go on with the same settings"
+            )
     if _first():
         write_text(path, text)  # other processes may be looking

@@ -13,7 +13,7 @@ from firenet_jax.events import Events, concatenate
 from firenet_jax.files import OutputError
 from firenet_jax.readers import open_recording
 from firenet_jax.scenes import SceneSettings
-from firenet_jax.sensor import EPS, FAULTY, SensorSettings
+from firenet_jax.sensor import EPS
 from firenet_jax.textures import load_textures
 from firenet_jax.video import write_video
 from firenet_jax.warp import warp
@@ -265,12 +265,6 @@ def test_one_in_twenty_is_for_validation(tmp_path, monkeypatch):
     parts = [path.parent.name for path in more]
     assert (parts.count("train"), parts.count("validation")) == (950, 50)
     assert set(first) < set(more) and len(first) == 100
-
-
-def test_faults_are_switched_on_but_options_stay():
-    chosen = dataset.with_faults(SensorSettings(mismatch=0.01, threshold=0.3))
-    assert (chosen.mismatch, chosen.threshold) == (0.01, 0.3)
-    assert (chosen.noise, chosen.leak, chosen.hot) == (FAULTY.noise, FAULTY.leak, FAULTY.hot)
 
 
 def test_a_disk_without_room_is_said_before_it_is_full(tmp_path, monkeypatch):

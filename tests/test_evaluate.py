@@ -10,17 +10,19 @@ import pytest
 from skimage.metrics import structural_similarity
 
 from firenet_jax import cli, evaluate, methods, metrics
+from firenet_jax.baselines import e2vid
 from firenet_jax.checkpoint import save_weights
 from firenet_jax.comparison import COMPARED, Gap, matched
 from firenet_jax.dataset import Picture, write_sequence
 from firenet_jax.evaluate import Evaluate, interval, plan, run
 from firenet_jax.events import Events
 from firenet_jax.files import OutputError
-from firenet_jax.methods import Missing, load
+from firenet_jax.methods import Missing, load, recurrent_unet
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pytorch_file import CheckpointError
 from firenet_jax.readers import open_recording
 from firenet_jax.report import METRICS, steps
+from firenet_jax.tensors import normalise, pack, voxelise
 from firenet_jax.windows import Window
 
 HEIGHT, WIDTH = 20, 28
@@ -397,13 +399,33 @@ def test_weights_that_are_not_there_or_not_finite(folder, tmp_path):
     [
         ({"data": ()}, "no data"), ({"keep_ratio": 0.0}, "keep ratio"),
         ({"warm_up": -1.0}, "warm_up"), ({"tolerance": float("nan")}, "tolerance"),
-        ({"start": 3.0, "stop": 2.0}, "stop"), ({"events": 0}, "events"),
+        ({"start": 3.0, "stop": 2.0}, "stop"), ({"stop": float("inf")}, "leave it out"),
+        ({"start": float("nan")}, "start is nan"), ({"events": 0}, "events"),
         ({"events": 5, "duration": 5.0}, "one way"), ({"sensor_size": "240"}, "WIDTHxHEIGHT"),
     ],
 )  # fmt: skip
 def test_impossible_settings(folder, tmp_path, choice, message):
     with pytest.raises(ValueError, match=message):
         settings(folder, tmp_path / "out", **choice)
+
+
+@pytest.mark.parametrize("sigmoid", [True, False], ids=["E2VID", "E2VID+"])
+def test_e2vid_runs_as_in_evreal(sigmoid):
+    """E2VID: normalised tensors, 1st and 99th percentile to 0 and 1; E2VID+: neither."""
+    small = e2vid.Settings(sigmoid=sigmoid, channels=4)
+    params = e2vid.initial_params(jax.random.key(0), small)
+    window = Window(events_of(500, 1000), 1000)
+    method = recurrent_unet("e2vid", params, small)
+    image = method.step(method.initial(HEIGHT, WIDTH), window)[1]
+
+    tensor = voxelise(pack([[window.events]]), height=HEIGHT, width=WIDTH)
+    tensor = normalise(tensor) if sigmoid else tensor
+    state = e2vid.initial_state(1, HEIGHT, WIDTH, small)
+    expected = np.asarray(e2vid.step(params, state, tensor[0], small)[1])[0]
+    if sigmoid:
+        low, high = np.percentile(expected, [1, 99])
+        expected = (expected - low) / (high - low)
+    np.testing.assert_allclose(image, expected, atol=1e-5)
 
 
 def test_nothing_recompiles_as_windows_vary(folder):

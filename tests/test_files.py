@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firenet_jax.files import OutputError, read_arrays, write_arrays, write_text
+from firenet_jax.files import OutputError, identity, read_arrays, write_arrays, write_text
 
 
 def test_what_was_written_is_read(tmp_path):
@@ -60,3 +60,18 @@ def test_arrays_that_would_run_code_are_refused(tmp_path):
     np.savez(tmp_path / "a.npz", x=np.array([print], object))
     with pytest.raises(OutputError, match="damaged"):
         read_arrays(tmp_path / "a.npz")
+
+
+def test_other_content_is_another_identity(tmp_path):
+    folder = tmp_path / "recording"
+    (folder / "images").mkdir(parents=True)
+    for name in ("events.txt", "images/frame.png"):
+        (folder / name).write_text("some")
+    seen = [identity(folder)]
+    for name in ("events.txt", "images/frame.png"):
+        (folder / name).write_text("other")
+        assert identity(folder / name)[:2] == [Path(name).name, 5]
+        seen.append(identity(folder))
+    (folder / "out.partial").mkdir()
+    (folder / "out.partial" / "frame.png").write_text("output")
+    assert seen[0] != seen[1] != seen[2] == identity(folder)

@@ -336,3 +336,17 @@ def test_video_gives_each_time_its_picture(scenes):
     for t, image in frames:
         expected = render(of(scenes, 3), 1e-6 * t, **SIZE).image
         np.testing.assert_allclose(image, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "choice, message",
+    [
+        ({"speed": (0.0, 100.0)}, "speed is 0 100, but is drawn log-uniformly"),
+        ({"zoom": (1.0, 0.5)}, "the least first"), ({"pause": 1.5}, "a probability"),
+        ({"objects": -1}, "objects is -1"), ({"tilt": -0.1}, "tilt"),
+        ({"white": (0.9, 2.0)}, "white is 0.9 2"),
+    ],
+)  # fmt: skip
+def test_impossible_scenes(choice, message):
+    with pytest.raises(ValueError, match=message):
+        SceneSettings(**choice)

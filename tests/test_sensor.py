@@ -16,12 +16,14 @@ from firenet_jax.sensor import (
     EPS,
     FAULTY,
     LONGEST,
+    TICKS,
     Sensor,
     SensorSettings,
     event_list,
     random_sensor,
     sequences,
     simulate,
+    with_faults,
 )
 from firenet_jax.tensors import pack, voxelise
 from firenet_jax.textures import load_textures
@@ -253,6 +255,33 @@ def test_wide_thresholds_and_mismatch(asymmetry):
     assert abs(np.std(own.on) - 0.03) < 0.001 and own.on.min() >= 0.01
 
 
+def test_faults_are_switched_on_but_what_is_given_stays():
+    chosen = with_faults(SensorSettings(mismatch=0.01, threshold=0.3))
+    assert (chosen.mismatch, chosen.threshold) == (0.01, 0.3)
+    assert (chosen.noise, chosen.leak, chosen.hot) == (FAULTY.noise, FAULTY.leak, FAULTY.hot)
+    chosen = with_faults(SensorSettings(mismatch=0.0, noise=(0.0, 0.0), refractory=5e-3))
+    sensor = random_sensor(jax.random.key(0), height=2, width=3, settings=chosen)
+    assert sensor.noise is None and sensor.on.shape == () and sensor.drift is not None
+    assert sensor.refractory == 5_000 * TICKS
+
+
+@pytest.mark.parametrize(
+    "choice, message",
+    [
+        ({"noise": (0.0, 10.0)}, "noise is 0 10, but is drawn log-uniformly"),
+        ({"leak": (0.5, 0.1)}, "the least first"), ({"hot": (0.5, 5.0)}, "part of the pixels"),
+        ({"cutoff": (1.0, np.nan)}, "cutoff"), ({"threshold_range": (0.0, 1.0)}, "threshold_range"),
+        ({"threshold": -1.0}, "threshold is -1"), ({"refractory": -1.0}, "refractory is -1"),
+        ({"mismatch": np.nan}, "mismatch"),
+        ({"threshold": 0.3, "threshold_range": (0.1, 0.6)}, "pass --threshold-range None too"),
+        ({"refractory": 5e-3, "refractory_range": (1e-4, 1e-3)}, "pass --refractory-range None"),
+    ],
+)  # fmt: skip
+def test_impossible_sensors(choice, message):
+    with pytest.raises(ValueError, match=message):
+        SensorSettings(**choice)
+
+
 def test_a_still_scene_is_silent_without_faults():
     assert len(listed(plain_sensor(), *still(1.0))) == 0
 
@@ -273,6 +302,11 @@ def test_shot_noise_has_its_rate_no_order_and_both_polarities():
     assert abs(spread / len(events) - 0.1).max() < 0.02
     per_pixel = np.bincount(events.y * W + events.x, minlength=H * W)
     assert per_pixel.var() == pytest.approx(per_pixel.mean(), rel=0.4)  # Poisson
+
+
+def test_shot_noise_keeps_its_rate_where_renderings_are_far_apart():
+    events = listed(with_only(4, noise=(60.0, 60.0)), *still(2.0))  # 0.6 events an interval
+    assert len(events) == pytest.approx(2 * 60 * H * W, rel=0.03)
 
 
 def test_hot_pixels_are_few_and_fire_all_the_time():

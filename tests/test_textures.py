@@ -69,6 +69,26 @@ def test_bad_pictures_are_named_and_left_out(tmp_path, caplog):
         assert name in caplog.text
 
 
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_sixteen_bits_are_as_bright_as_eight(tmp_path, suffix):
+    ramp = np.linspace(0, 255, 100 * 100).reshape(100, 100).astype(np.uint8)
+    Image.fromarray(ramp).save(tmp_path / "a.png")
+    (tmp_path / "deep").mkdir()
+    deep = 257 * ramp.astype(np.uint16)
+    Image.fromarray(deep).save(tmp_path / "deep" / f"a{suffix}")
+    expected = load_textures([tmp_path / "a.png"], 3, 64)
+    np.testing.assert_array_equal(load_textures(tmp_path / "deep", 3, 64), expected)
+
+
+def test_fractions_are_refused_by_name(tmp_path, caplog):
+    picture(tmp_path / "good.png")
+    Image.fromarray(np.random.default_rng(0).random((100, 100), np.float32)).save(
+        tmp_path / "fractions.tif"
+    )
+    load_textures(tmp_path, 4, 64)
+    assert "fractions.tif: it holds fractions" in caplog.text
+
+
 def test_folders_that_cannot_be_used(tmp_path):
     with pytest.raises(ValueError, match="no such folder"):
         load_textures(tmp_path / "nowhere")

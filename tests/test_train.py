@@ -156,15 +156,31 @@ def test_remat_and_bfloat16_change_little(tmp_path):
         assert np.abs(a - c).max() < 0.1 * np.abs(a).max()
 
 
+def begun(folder, settings):
+    """A run's folder after its first line of the log."""
+    train._same_settings(folder, settings)
+    (folder / "log.jsonl").write_text('{"step": 1, "kind": "train", "loss": 1.0}\n')
+
+
 def test_other_settings_do_not_continue_a_run(tmp_path):
+    begun(tmp_path, tiny(tmp_path))
     train._same_settings(tmp_path, tiny(tmp_path))
-    train._same_settings(tmp_path, tiny(tmp_path))
-    with pytest.raises(ValueError, match="other settings"):
+    with pytest.raises(ValueError, match=r"other settings \(seed was 0, now 1\)"):
         train._same_settings(tmp_path, tiny(tmp_path, seed=1))
+    with pytest.raises(ValueError, match=r"\(loss.l1 was 1.0, now 0.5\)"):
+        train._same_settings(tmp_path, tiny(tmp_path, loss=Loss(l0=1, l1=0.5)))
+    # how often it is looked at says nothing about what is computed
+    train._same_settings(tmp_path, tiny(tmp_path, log_every=7, save_every=60.0, validate_every=4))
+
+
+def test_a_run_that_failed_before_its_first_step_blocks_no_folder(tmp_path):
+    with pytest.raises(ValueError, match="no such folder"):
+        run(tiny(tmp_path / "run", images=tmp_path / "typo"))
+    train._same_settings(tmp_path / "run", tiny(tmp_path / "run"))
 
 
 def test_a_run_older_than_an_option_goes_on_if_that_stands_at_its_default(tmp_path):
-    train._same_settings(tmp_path, tiny(tmp_path))
+    begun(tmp_path, tiny(tmp_path))
     path = tmp_path / "settings.json"
     older = json.loads(path.read_text())
     del older["remat"], older["scene"]["plain"]
@@ -235,7 +251,10 @@ def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypa
     [
         ({"batch": 0}, "batch"), ({"learning_rate": -1.0}, "learning_rate"),
         ({"windows": 22}, "at most 21"), ({"windows": 1}, "more than 1"),
-        ({"warmup": 6}, "warmup"),
+        ({"warmup": 6}, "warmup"), ({"warmup": -5}, "warmup"),
+        ({"log_every": 0}, "log_every"), ({"validate_every": 0}, "validate_every"),
+        ({"crop": 10}, "smaller than 11"), ({"procedural": 3.0}, "procedural"),
+        ({"motion": (0.0, 2.0)}, "motion is 0 2"), ({"motion": (2.0, 1.0)}, "the least first"),
     ],
 )  # fmt: skip
 def test_impossible_settings(tmp_path, choice, message):

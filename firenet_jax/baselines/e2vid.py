@@ -146,8 +146,8 @@ def step(
 ) -> tuple[State, jax.Array]:
     """One window: (State, (B, H, W, 5)) -> (State, (B, H, W)); settings are static under jit.
 
-    event_tensor: normalised (`tensors.normalise`) for E2VID, as it is for E2VID+. Padded here by
-    reflection to multiples of 8 (rpg_e2vid; EVREAL pads zeros), the larger half above and left.
+    event_tensor: normalised (`tensors.normalise`) for E2VID, not normalised for E2VID+. Padded here
+    by reflection to multiples of 8 (rpg_e2vid; EVREAL pads zeros), the larger half above and left.
     Whoever wants the mask of `pictures` to see the padded image pads before and crops after.
     """
     height, width = event_tensor.shape[1:3]
