@@ -23,7 +23,6 @@ Writes results/scaling.json and .png (scaling_gpu on a GPU).
 
 import argparse
 import os
-import socket
 import subprocess
 import sys
 import tempfile
@@ -130,12 +129,12 @@ import sys, time
 from pathlib import Path
 from firenet_jax.pipeline import Reconstruct, run
 folder, output, *where = sys.argv[1:]
-coordinator, processes, process = (where[0], int(where[1]), int(where[2])) if where else [None] * 3
+processes, process = map(int, where) if where else [None] * 2
 recordings = tuple(sorted(Path(folder).glob("*.txt")))
-choices = dict(coordinator=coordinator, processes=processes, process=process, overwrite=True)
+choices = dict(processes=processes, process=process, overwrite=True)
 run(Reconstruct(recordings, Path(output), **choices))
 start = time.perf_counter()
-run(Reconstruct(recordings, Path(output), overwrite=True))
+run(Reconstruct(recordings, Path(output), **choices))
 print("seconds", time.perf_counter() - start)
 """
 
@@ -153,9 +152,6 @@ def on_devices(recordings: int, events: int) -> list[dict]:
             size = f"{POINT['width']} {POINT['height']}\n"
             (folder / f"r{number}.txt").write_text(size + lines)
         for devices, processes in ((1, 1), (2, 1), (4, 1), (1, 2)):
-            with socket.socket() as free:
-                free.bind(("localhost", 0))
-                address = f"localhost:{free.getsockname()[1]}"
             environment = os.environ | {
                 "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
                 "JAX_PLATFORMS": "cpu",
@@ -163,7 +159,7 @@ def on_devices(recordings: int, events: int) -> list[dict]:
             command = [sys.executable, "-c", DEVICES, folder, folder / f"out{devices}{processes}"]
             started = [
                 subprocess.Popen(
-                    [*command, *([address, "2", str(process)] if processes > 1 else [])],
+                    [*command, *(["2", str(process)] if processes > 1 else [])],
                     env=environment,
                     stdout=subprocess.PIPE,
                     stderr=subprocess.DEVNULL,

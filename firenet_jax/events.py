@@ -95,7 +95,7 @@ def checked(
     width: int | None,
     place: Callable[[int], str] = event_number,
 ) -> Iterator[Events]:
-    """Passes chunks on; raises RecordingError at the first event that cannot be.
+    """Passes events on up to the first one that cannot be, where it raises RecordingError.
 
     Time must not run backwards, within a chunk or between two; x and y must not be negative, nor
     reach the sensor's width and height where these are known. `place(row)` names the row (counted
@@ -105,35 +105,40 @@ def checked(
     for events in chunks:
         if len(events) == 0:
             continue
-        t = events.t
-        if last is not None and t[0] < last:
-            _refuse_time(path, place(rows), t[0], last)
+        t, x, y = events.t, events.x, events.y
+        last = t[0] if last is None else last
+        limits = (width or np.inf, height or np.inf)
         steps = np.diff(t)
-        if steps.size and steps.min() < 0:
-            row = int(np.argmax(steps < 0)) + 1
-            _refuse_time(path, place(rows + row), t[row], t[row - 1])
-        for name, column, size in (("x", events.x, width), ("y", events.y, height)):
-            if column.min() < 0:
-                row = int(np.argmax(column < 0))
-                raise RecordingError(
-                    f"{path}, {place(rows + row)}: {name} is {column[row]}, but coordinates are "
-                    "0 or more: the file is damaged or of another format"
-                )
-            if size is not None and column.max() >= size:
-                row = int(np.argmax(column >= size))
-                raise RecordingError(
-                    f"{path}, {place(rows + row)}: {name} is {column[row]}, outside the sensor of "
-                    f"{width}x{height} pixels: pass the right --sensor-size WIDTHxHEIGHT"
-                )
-        rows, last = rows + len(events), t[-1]
-        yield events
-
-
-def _refuse_time(path: Path, where: str, time: int, previous: int):
-    raise RecordingError(
-        f"{path}, {where}: time runs backwards, from {previous} to {time} us: "
-        "sort the events by time, or cut the recording there"
-    )
+        if (
+            t[0] >= last
+            and (steps.size == 0 or steps.min() >= 0)
+            and min(x.min(), y.min()) >= 0
+            and x.max() < limits[0]
+            and y.max() < limits[1]
+        ):
+            rows, last = rows + len(events), t[-1]
+            yield events
+            continue
+        steps = np.insert(steps, 0, t[0] - last)
+        row = int(np.argmax((steps < 0) | (x < 0) | (x >= limits[0]) | (y < 0) | (y >= limits[1])))
+        if row:
+            yield events.select(slice(row))  # whoever stops before the damage never meets it
+        where = f"{path}, {place(rows + row)}"
+        if steps[row] < 0:
+            raise RecordingError(
+                f"{where}: time runs backwards, from {t[row] - steps[row]} to {t[row]} us: "
+                "sort the events by time, or --stop before"
+            )
+        name, value = ("y", y[row]) if 0 <= x[row] < limits[0] else ("x", x[row])
+        if value < 0:
+            raise RecordingError(
+                f"{where}: {name} is {value}, but coordinates are 0 or more: the file is damaged "
+                "or of another format"
+            )
+        raise RecordingError(
+            f"{where}: {name} is {value}, outside the sensor of {width}x{height} pixels: pass the "
+            "right --sensor-size WIDTHxHEIGHT"
+        )
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:

@@ -11,6 +11,7 @@ import dataclasses
 import hashlib
 import itertools
 import json
+import math
 import os
 import time
 from collections import deque
@@ -26,21 +27,36 @@ from tqdm import tqdm
 
 from firenet_jax import filters
 from firenet_jax.checkpoint import load_weights
-from firenet_jax.devices import BATCH, EVERYWHERE, check_processes, in_a_row, join, shared
+from firenet_jax.devices import BATCH, EVERYWHERE, in_a_row, shared
 from firenet_jax.events import Events, Recording, RecordingError, logger, parse_size
-from firenet_jax.files import OutputError, identity, partial_name, read_arrays, writing
+from firenet_jax.files import (
+    OutputError,
+    identity,
+    partial_name,
+    read_arrays,
+    write_text,
+    writing,
+)
 from firenet_jax.network import Weights
 from firenet_jax.overlap import ahead
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import Network, Session, events_to_pictures, initial_session
 from firenet_jax.tensors import IN_LISTS, Packed, pack_for_devices
-from firenet_jax.video import VIDEOS, FolderWriter, VideoWriter, check_output, open_writer
+from firenet_jax.video import (
+    OTHER_FILES,
+    VIDEOS,
+    FolderWriter,
+    VideoWriter,
+    check_output,
+    followed,
+    open_writer,
+)
 from firenet_jax.windows import Window, Windows, cut
 
 # Settings that the pictures do not depend on, or that are told in another way.
 ELSEWHERE = ("recordings", "output", "weights", "fps", "chunk", "batch", "overwrite")
-ELSEWHERE += ("coordinator", "processes", "process")
+ELSEWHERE += ("processes", "process")
 RESUME_EVERY = 5.0  # seconds between two saves of what a resumed run needs
 
 
@@ -88,10 +104,8 @@ class Reconstruct:
     """Recordings that run side by side, shared by the devices (default: one for each device)."""
     overwrite: bool = False
     """Replace an output that exists."""
-    coordinator: str | None = None
-    """host:port of process 0, where several processes share the recordings; start each so."""
     processes: int | None = None
-    """How many processes."""
+    """How many processes, on this machine or on many, deal the recordings out among them."""
     process: int | None = None
     """Which one this is, from 0."""
 
@@ -106,9 +120,16 @@ class Reconstruct:
             raise ValueError(f"unsharp is {self.display.unsharp}, but must be 0 or more")
         if not self.recordings:
             raise ValueError("no recording: name one or more files or folders")
+        for name in ("start", "stop"):
+            value = getattr(self, name)
+            if value is not None and not math.isfinite(value):
+                raise ValueError(f"{name} is {value} s, but must be a time: leave it out for none")
         if self.stop is not None and self.stop <= (self.start or 0):
             raise ValueError(f"stop is {self.stop} s, but must come after the start")
-        check_processes(self.coordinator, self.processes, self.process)
+        if (self.process is None) != (self.processes is None):
+            raise ValueError("several processes need both of --processes and --process")
+        if self.process is not None and not 0 <= self.process < self.processes:
+            raise ValueError(f"process is {self.process}, but counts from 0 to processes - 1")
 
 
 class Job(NamedTuple):
@@ -167,22 +188,25 @@ def run(settings: Reconstruct) -> list[Path]:
     """Does what the settings say; returns the outputs, of several processes those of this one.
 
     Raises RecordingError, CheckpointError, OutputError or ValueError, in one sentence."""
-    join(settings.coordinator, settings.processes, settings.process)
     weights = load_weights(settings.weights)
-    # Recordings have nothing to do with each other: processes deal them out and never talk.
-    mine = slice(jax.process_index(), None, jax.process_count())
+    # Recordings have nothing to do with each other, so processes need not know of each other:
+    # as one of JAX's own processes, one that is done or dies would take the others with it.
+    mine = slice(settings.process or 0, None, settings.processes or 1)
     outputs = plan(settings.recordings, settings.output)[mine]
     if not outputs:
         return []
-    for output in outputs:
-        check_output(output, settings.overwrite)
     size = parse_size(settings.sensor_size)
-    recordings = [open_recording(path, size) for path in settings.recordings[mine]]
-    jobs = [
-        Job(recording, output, describe(settings, recording, weights))
-        for recording, output in zip(recordings, outputs, strict=True)
-    ]
-    counts = [recording.count for recording in recordings]
+    jobs = []
+    for path, output in zip(settings.recordings[mine], outputs, strict=True):
+        recording = open_recording(path, size)
+        job = Job(recording, output, describe(settings, recording, weights))
+        if is_done(job):
+            logger.warning("%s: done by the run that this one continues", output)
+            continue
+        check_output(output, settings.overwrite)
+        check_position(job, settings)
+        jobs.append(job)
+    counts = [job.recording.count for job in jobs]
     partly = settings.start or settings.stop or settings.windows.step
     known = None if None in counts or partly else sum(counts)
     began, failed = time.monotonic(), {}
@@ -192,8 +216,8 @@ def run(settings: Reconstruct) -> list[Path]:
             for same in by_sensor_size(jobs)
         ]
     seconds = time.monotonic() - began
-    shown, events = (sum(column) for column in zip(*total, strict=True))
-    done = [output for output in outputs if output not in failed]
+    shown, events = (sum(column) for column in zip((0, 0), *total, strict=True))
+    done = [job.output for job in jobs if job.output not in failed]
     if done:
         rates = f"{shown / seconds:.1f} pictures/s, {events / seconds / 1e6:.2f} Mev/s"
         print(
@@ -203,22 +227,50 @@ def run(settings: Reconstruct) -> list[Path]:
     if failed:
         rest = "; the other recordings are done" if done else ""
         raise RecordingError("; ".join(map(str, failed.values())) + rest)
+    for output in outputs:
+        done_file(output).unlink(missing_ok=True)
     return outputs
 
 
 def plan(recordings: tuple[Path, ...], output: Path) -> list[Path]:
     """The name of each recording's output: `output` itself if there is only one recording."""
     if len(recordings) == 1:
-        return [output]
-    stems = [path.resolve().stem for path in recordings]
+        return [followed(output)]
+    stems = [_stem(path.resolve()) for path in recordings]
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
     if twice:
         raise OutputError(
             f"two recordings are named {twice} and would write the same output: run them apart"
         )
     if output.suffix in VIDEOS:
-        return [output.with_suffix("") / f"{stem}{output.suffix}" for stem in stems]
-    return [output / stem for stem in stems]
+        return [followed(output.with_suffix("") / f"{stem}{output.suffix}") for stem in stems]
+    return [followed(output / stem) for stem in stems]
+
+
+def _stem(path: Path) -> str:
+    """The name without its suffix, nor with one before that: `a.txt.gz` -> `a`, `a.1.txt` -> `a.1`.
+
+    That of a folder is its name.
+    """
+    if path.is_dir():
+        return path.name
+    path = path.with_suffix("")
+    while path.suffix.lower() in OTHER_FILES:
+        path = path.with_suffix("")
+    return path.name
+
+
+def done_file(output: Path) -> Path:
+    """Beside an output of several: it is whole, but others of the same run are not."""
+    return output.with_name(f"{output.name}.done.json")
+
+
+def is_done(job: Job) -> bool:
+    """Whether an interrupted run of the same settings has left this output, one of several."""
+    try:
+        return job.output.exists() and done_file(job.output).read_text() == job.record
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def by_sensor_size(jobs: list[Job]) -> list[list[Job]]:
@@ -307,9 +359,11 @@ def reconstruct_jobs(
                     failed[running.job.output] = running.error
                     open_jobs.pop(slot).writer.abandon()
                 elif part.ends:
-                    if isinstance(running.writer, FolderWriter):
-                        position_file(running.job).unlink(missing_ok=True)
                     running.writer.finish()
+                    if isinstance(running.writer, FolderWriter):
+                        (running.job.output / "resume.npz").unlink(missing_ok=True)
+                    if len(settings.recordings) > 1:
+                        write_text(done_file(running.job.output), running.job.record)
                     del open_jobs[slot]
                 else:
                     publish_position(part)
@@ -408,6 +462,11 @@ def describe(settings: Reconstruct, recording: Recording, weights: Weights) -> s
     choices = dataclasses.asdict(settings)
     for name in ELSEWHERE:
         del choices[name]
+    if settings.hot_pixels not in (None, "auto"):  # what the file holds counts, not its name
+        hot = hot_pixels(settings.hot_pixels, recording)
+        choices["hot_pixels"] = hashlib.sha256(hot.tobytes()).hexdigest()
+    if settings.output.suffix in VIDEOS:
+        choices["fps"] = settings.fps
     return json.dumps(
         {
             "recording": identity(recording.path),
@@ -444,6 +503,25 @@ def publish_position(part: Part) -> None:
         os.replace(path, position_file(part.running.job))
 
 
+def check_position(job: Job, settings: Reconstruct) -> dict[str, np.ndarray] | None:
+    """What an interrupted run of the same settings has left in its folder; None if there is none.
+
+    Raises OutputError where another run has left something, which `overwrite` allows to replace.
+    """
+    path = position_file(job)
+    if job.output.suffix in VIDEOS or not path.exists():
+        return None
+    saved = read_arrays(path)
+    if str(saved.get("record")) == job.record:
+        return saved
+    if not settings.overwrite:
+        raise OutputError(
+            f"{path.parent} holds an unfinished run of other settings or another recording: "
+            "remove it or pass --overwrite"
+        )
+    return None
+
+
 def load_position(job: Job, settings: Reconstruct) -> tuple[int, Session]:
     """(pictures on disk, the state after them) of an interrupted run; (0, the initial state) if
     there is none."""
@@ -453,22 +531,15 @@ def load_position(job: Job, settings: Reconstruct) -> tuple[int, Session]:
     path = position_file(job)
     for unpublished in path.parent.glob("resume.*.npz"):
         unpublished.unlink()
-    if job.output.suffix in VIDEOS or not path.exists():
+    saved = check_position(job, settings)
+    if saved is None:
+        path.unlink(missing_ok=True)
         return 0, initial
-    saved = read_arrays(path)
-    if str(saved.get("record")) == job.record:
-        tree = jax.tree.structure(initial)
-        try:
-            done = int(saved["pictures"])
-            session = tree.unflatten([saved[f"state{i}"] for i in range(tree.num_leaves)])
-        except KeyError as error:  # of another version of this program
-            raise OutputError(f"{path} lacks {error}: remove it and run again") from error
-        logger.warning("%s: going on after %d pictures", job.output, done)
-        return done, session
-    if not settings.overwrite:
-        raise OutputError(
-            f"{path.parent} holds an unfinished run of other settings or another recording: "
-            "remove it or pass --overwrite"
-        )
-    path.unlink()
-    return 0, initial
+    tree = jax.tree.structure(initial)
+    try:
+        done = int(saved["pictures"])
+        session = tree.unflatten([saved[f"state{i}"] for i in range(tree.num_leaves)])
+    except KeyError as error:  # of another version of this program
+        raise OutputError(f"{path} lacks {error}: remove it and run again") from error
+    logger.warning("%s: going on after %d pictures", job.output, done)
+    return done, session

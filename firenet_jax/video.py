@@ -6,7 +6,9 @@ and renames it in `finish`; `write_video` does all of it.
 
 import contextlib
 import os
+import re
 import shutil
+import tempfile
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
@@ -18,12 +20,26 @@ from PIL import Image
 from firenet_jax.files import OutputError, partial_name, writing
 
 VIDEOS = (".mp4", ".gif")
+# What is no folder's name: a dot alone, as in out_0.35, does not make a file of it.
+OTHER_FILES = (
+    ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".png", ".apng", ".jpg",
+    ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".npy", ".npz", ".h5", ".hdf5", ".zip", ".gz",
+    ".txt", ".csv", ".json", ".raw", ".dat", ".bin", ".es", ".aedat", ".aedat4",
+    ".bag", ".db3", ".mcap",
+)  # fmt: skip
+OURS = re.compile(r"timestamps\.txt|resume\.npz|frame_\d{10,}\.png")  # in a folder of pictures
+GIF_RATE = 100  # pictures per second, the most that the format can say
 PNG_LEVEL = 4  # on grey pictures 25 % faster than the default 6, files 2 % larger
+
+
+def followed(path: Path) -> Path:
+    """What a link points to: renaming would replace the link itself."""
+    return path.resolve() if path.is_symlink() else path
 
 
 def check_output(path: Path, overwrite: bool) -> None:
     """Raises OutputError if something is at the final name that must not or cannot be replaced."""
-    if path.suffix and path.suffix not in VIDEOS:
+    if path.suffix.lower() in (*VIDEOS, *OTHER_FILES) and path.suffix not in VIDEOS:
         raise OutputError(
             f"{path}: cannot write {path.suffix} files: name a folder (for png), .mp4 or .gif"
         )
@@ -34,10 +50,14 @@ def check_output(path: Path, overwrite: bool) -> None:
     occupied = path.is_file() or (path.is_dir() and any(path.iterdir()))
     if occupied and not overwrite:
         raise OutputError(f"{path} exists: choose another output or pass --overwrite")
-    if occupied and path.is_dir() and not (path / "timestamps.txt").is_file():
-        raise OutputError(
-            f"{path} is a folder that this program did not write: choose another output"
-        )
+    if path.is_dir() and path.is_mount():
+        raise OutputError(f"{path} is a disk of its own: choose a folder in it")
+    if occupied and path.is_dir():
+        strange = next((e.name for e in path.iterdir() if not OURS.fullmatch(e.name)), None)
+        if strange:
+            raise OutputError(
+                f"{path} holds {strange}, which this program did not write: choose another output"
+            )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -69,7 +89,8 @@ class FolderWriter:
         name = self.partial / f"frame_{self.count:010d}.png"
         with writing(self.path):
             Image.fromarray(picture).save(name, compress_level=PNG_LEVEL)
-            self.stamps.write(f"{time // 1_000_000}.{time % 1_000_000:06d}\n")
+            seconds, rest = divmod(abs(time), 1_000_000)
+            self.stamps.write(f"{'-' * (time < 0)}{seconds}.{rest:06d}\n")
         self.count += 1
 
     def flush(self) -> None:
@@ -79,16 +100,16 @@ class FolderWriter:
     def finish(self) -> None:
         with writing(self.path):
             self.stamps.close()
-        for extra in self.partial.glob("frame_*.png"):  # of a longer run before this one
-            if int(extra.stem.removeprefix("frame_")) >= self.count:
-                extra.unlink()
-        old = None
-        if self.path.exists() and any(self.path.iterdir()):
-            old = self.path.with_name(f"{self.path.name}.old")
-            self.path.rename(old)
-        self.partial.rename(self.path)
-        if old:
-            shutil.rmtree(old)
+            for extra in self.partial.glob("frame_*.png"):  # of a longer run before this one
+                if int(extra.stem.removeprefix("frame_")) >= self.count:
+                    extra.unlink()
+            old = None
+            if self.path.exists() and any(self.path.iterdir()):
+                old = Path(tempfile.mkdtemp(prefix=f"{self.path.name}.old.", dir=self.path.parent))
+                self.path.rename(old / self.path.name)
+            self.partial.rename(self.path)
+            if old:
+                shutil.rmtree(old)
 
     def abandon(self) -> None:
         """Stops writing; the partial folder stays, for the next run to go on."""
@@ -101,6 +122,11 @@ class VideoWriter:
 
     def __init__(self, path: Path, fps: float):
         self.path, self.partial = path, partial_name(path)
+        if path.suffix == ".gif" and fps > GIF_RATE:
+            raise OutputError(
+                f"{path}: a gif shows at most {GIF_RATE} pictures per second, not {fps:g}: choose "
+                "a smaller --fps or .mp4"
+            )
         self.rate = Fraction(fps).limit_denominator(1000)
         self.count = 0
         with writing(path):
@@ -178,7 +204,7 @@ def write_video(path: str | Path, pictures: Iterable[np.ndarray], fps: float = 3
 
     Raises OutputError for another suffix or a name that cannot be written.
     """
-    path = Path(path)
+    path = followed(Path(path))
     check_output(path, overwrite=True)
     writer = open_writer(path, fps)
     try:

@@ -7,12 +7,15 @@ partial: no event is lost. Memory holds one window and one chunk, whatever the r
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Annotated, NamedTuple
 
 import numpy as np
 import tyro
 
 from firenet_jax.events import Events, Recording, RecordingError, concatenate, logger
+
+APART = 3_600_000_000  # microseconds between events and frames of one clock, at most
 
 
 class Window(NamedTuple):
@@ -77,12 +80,13 @@ def cut(recording: Recording, windows: Windows, chunks: Iterable[Events] | None 
     """
     chunks = iter(recording.events() if chunks is None else chunks)
     if windows.between_frames:
-        if recording.frames is None or len(recording.frames.times) < 2:
+        times = () if recording.frames is None else np.unique(recording.frames.times)
+        if len(times) < 2:
             raise RecordingError(
                 f"{recording.path}: windows between frames need a recording with two frames or "
-                "more: use --events-per-pixel or --duration"
+                "more, each at a time of its own: use --events-per-pixel or --duration"
             )
-        return _by_time(chunks, lambda first: _frame_spans(recording.frames.times, first))
+        return _by_time(chunks, lambda first: _frame_spans(recording.path, times, first))
     if windows.duration is not None:
         step = windows.duration if windows.step is None else windows.step
         if step > windows.duration:
@@ -157,19 +161,26 @@ def _window(events: Events, start: int, stop: int, end: int = 0) -> Window:
 
 
 def _grid_spans(duration: float, step: float, first: int) -> Iterator[tuple[int, int]]:
-    """Milliseconds -> microsecond spans; each is computed from k, so rounding never adds up."""
+    """Milliseconds -> microsecond spans; each is computed from k, so rounding never adds up.
+
+    In fractions: of floats, an end and the next start would round to two microseconds.
+    """
+    step, duration = (Fraction(str(value)) * 1000 for value in (step, duration))
     for k in itertools.count():
-        start = first + round(k * step * 1000)
-        # Without overlap the end is the next start, to the microsecond.
-        yield start, first + round((k * step + duration) * 1000)
+        yield first + round(k * step), first + round(k * step + duration)
 
 
-def _frame_spans(times: np.ndarray, first: int) -> Iterator[tuple[int, int]]:
+def _frame_spans(path, times: np.ndarray, first: int) -> Iterator[tuple[int, int]]:
     """Frame times -> spans, the clock of the frames going on before the first and after the last.
 
     So a recording whose frames begin late or end early has no window of all the rest.
     """
-    times = np.unique(times)
+    if max(times[0] - first, first - times[-1]) > APART:
+        raise RecordingError(
+            f"{path}: its frames are from {times[0] / 1e6:.6f} to {times[-1] / 1e6:.6f} s, its "
+            f"events begin at {first / 1e6:.6f} s: they are not on one clock; use "
+            "--events-per-pixel or --duration"
+        )
     interval = max(1, int(np.median(np.diff(times))))
     missing = max(0, (int(times[0]) - first) // interval)
     before = times[0] - interval * np.arange(missing, 0, -1)

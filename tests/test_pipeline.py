@@ -1,3 +1,4 @@
+import gzip
 import json
 import subprocess
 import sys
@@ -7,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 from PIL import Image
-from processes import finish, start, together
+from processes import finish, start
 
 from firenet_jax import pipeline
 from firenet_jax.checkpoint import save_weights
@@ -87,10 +88,10 @@ from firenet_jax.pipeline import Reconstruct, run
 from firenet_jax.windows import Windows
 
 weights, folder, output, *where = sys.argv[1:]
-coordinator, processes, process = (where[0], int(where[1]), int(where[2])) if where else [None] * 3
+processes, process = map(int, where) if where else [None] * 2
 recordings = tuple(sorted(Path(folder).glob("*.txt")))
 run(Reconstruct(recordings, Path(output), Path(weights), Windows(events=100), chunk=4,
-    coordinator=coordinator, processes=processes, process=process))
+    processes=processes, process=process))
 """
 
 
@@ -104,7 +105,7 @@ def test_devices_and_processes_share_recordings_and_give_the_same(tmp_path, weig
     arguments = SHARED, weights, tmp_path / "in"
     finish(start(*arguments, tmp_path / "one"))
     finish(start(*arguments, tmp_path / "four", devices=4))
-    together(*arguments, tmp_path / "two")
+    finish(*(start(*arguments, tmp_path / "two", 2, process) for process in range(2)))
 
     for n in lengths:
         expected, stamps = pictures_of(tmp_path / "one" / f"r{n}")
@@ -272,7 +273,66 @@ def test_a_damaged_recording_does_not_keep_others_from_being_done(
     for name in ("good", "fine"):
         np.testing.assert_array_equal(pictures_of(tmp_path / "all" / name)[0], expected)
     left = {path.name for path in (tmp_path / "all").iterdir()}
-    assert left == {"good", "fine", "late.partial"}
+    assert left == {"good", "fine", "late.partial", "good.done.json", "fine.done.json"}
+    # mended, they are done by the same command, the others are not done again
+    monkeypatch.setattr(pipeline, "cut", whole)
+    write_recording(tmp_path / "early.txt", 900, seed=3)
+    run(settings(weights, tuple(paths), tmp_path / "all", batch=batch))
+    assert {path.name for path in (tmp_path / "all").iterdir()} == set(names)
+
+
+def test_an_interrupted_run_of_several_goes_on(tmp_path, weights, monkeypatch, caplog):
+    paths = tuple(write_recording(tmp_path / f"{name}.txt", 1500, seed=3) for name in "abc")
+    run(settings(weights, paths[:1], tmp_path / "alone"))
+    expected, _ = pictures_of(tmp_path / "alone")
+    written, write = [], FolderWriter.write
+
+    def counted(self, *args):
+        written.append(self.path.name)
+        if len(written) == 20:
+            raise Interrupted
+        write(self, *args)
+
+    monkeypatch.setattr(FolderWriter, "write", counted)
+    monkeypatch.setattr(pipeline, "RESUME_EVERY", 0)
+    with pytest.raises(Interrupted):
+        run(settings(weights, paths, tmp_path / "out", batch=1))
+    written += ["-"] * 100
+    # other settings are refused before anything is computed
+    with pytest.raises(OutputError, match="a exists"):
+        run(settings(weights, paths, tmp_path / "out", batch=1, windows=Windows(events=90)))
+    with pytest.raises(OutputError, match="unfinished run of other settings"):
+        run(settings(weights, paths[1:], tmp_path / "out", batch=1, windows=Windows(events=90)))
+    assert written[-1] == "-"
+    run(settings(weights, paths, tmp_path / "out", batch=1))
+    assert "a: done by the run that this one continues" in caplog.text
+    assert written.count("a") == 15 and written.count("b") < 30 and written.count("c") == 15
+    for name in "abc":
+        np.testing.assert_array_equal(pictures_of(tmp_path / "out" / name)[0], expected)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == set("abc")
+
+
+def test_the_hot_pixels_of_a_file_not_its_name_are_what_a_run_goes_on_with(
+    tmp_path, weights, monkeypatch
+):
+    recording, hot = write_recording(tmp_path / "a.txt"), tmp_path / "hot.txt"
+    hot.write_text("1,1\n")
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "RESUME_EVERY", 0)
+        interrupt_after(patch, 9)
+        with pytest.raises(Interrupted):
+            run(settings(weights, (recording,), tmp_path / "out", hot_pixels=str(hot)))
+    hot.write_text("1,1\n3,4\n")
+    with pytest.raises(OutputError, match="unfinished run of other settings"):
+        run(settings(weights, (recording,), tmp_path / "out", hot_pixels=str(hot)))
+
+
+def test_names_with_dots(tmp_path, weights):
+    paths = [write_recording(tmp_path / f"run.{n}.txt", 300, seed=n) for n in (1, 2)]
+    packed = tmp_path / "b.txt.gz"
+    packed.write_bytes(gzip.compress(paths[0].read_bytes()))
+    run(settings(weights, (*paths, packed), tmp_path / "out"))
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"run.1", "run.2", "b"}
 
 
 def test_no_events_is_an_error(tmp_path, weights):
@@ -295,6 +355,8 @@ def test_the_same_name_twice_is_an_error(tmp_path, weights):
     "choice, message",
     [
         ({"chunk": 0}, "chunk"), ({"fps": -1.0}, "fps"), ({"stop": -1.0}, "stop"),
+        ({"stop": float("inf")}, "leave it out"), ({"start": float("nan")}, "start is nan"),
+        ({"process": 1}, "both of --processes"), ({"process": 2, "processes": 2}, "from 0"),
         ({"sensor_size": "240"}, "WIDTHxHEIGHT"), ({"sensor_size": "0x5"}, "WIDTHxHEIGHT"),
     ],
 )  # fmt: skip

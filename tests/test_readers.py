@@ -184,6 +184,36 @@ def test_text(tmp_path, content):
     assert (recording.height, recording.width, recording.format) == (240, 320, "text")
 
 
+@pytest.mark.parametrize("whole", [True, False], ids=["whole", "decimals"])
+@pytest.mark.parametrize(
+    "name, unit",
+    [("t_us", 1), ("time [us]", 1), ("timestamp (ns)", 1e-3), ("t_ns", 1e-3), ("time_ms", 1e3),
+     ("ts [ms since start]", 1e3), ("time (s)", 1e6)],
+)  # fmt: skip
+def test_text_in_the_unit_that_its_names_tell(tmp_path, caplog, name, unit, whole):
+    times = T if unit <= 1 or not whole else T // unit * unit
+    rows = [(t, x, y, p) for t, (_, x, y, p) in zip(times, EVENTS, strict=True)]
+    lines = [
+        f"{round(t / unit) if whole else float(t / unit)!r},{x},{y},{p}" for t, x, y, p in rows
+    ]
+    path = write(tmp_path / "a.csv", f"{name},x [px],y,p\n" + "\n".join(lines))
+    np.testing.assert_array_equal(events_of(path, (240, 320)).t, times)
+    assert "read as microseconds" not in caplog.text
+
+
+@pytest.mark.parametrize("bad", ["0.5 1 x 1", "0.5 1 2", "0.05 1 2 1", "0.5 1 999 1"])
+def test_events_before_the_damage_are_read(tmp_path, bad):
+    good = [f"{k / 10} 1 2 1" for k in range(5)]
+    recording = open_recording(
+        write(tmp_path / "a.txt", "\n".join([*good, bad, *good])), (240, 320)
+    )
+    read = []
+    with pytest.raises(RecordingError, match="line 6"):
+        for events in recording.events():
+            read.append(events.t)
+    assert np.concatenate(read).tolist() == [100_000 * k for k in range(5)]
+
+
 def test_text_in_microseconds(tmp_path, caplog):
     check(write(tmp_path / "a.csv", "t,x,y,p\n" + "\n".join(US).replace(" ", ",")))
     assert "read as microseconds" in caplog.text

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import av
 import numpy as np
 import pytest
@@ -94,13 +96,66 @@ def test_outputs_that_cannot_be(tmp_path):
     (tmp_path / "movie.mp4").write_text("")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("")
+    write_video(tmp_path / "mixed", ramp(1))
+    (tmp_path / "mixed" / "events.txt").write_text("")  # a recording, which must not be lost
     for name, overwrite, message in [
         ("video.avi", False, "cannot write .avi"),
         ("file", True, "is a file"),
         ("movie.mp4", False, "pass --overwrite"),
         ("mine", False, "pass --overwrite"),
-        ("mine", True, "did not write"),
+        ("mine", True, "holds thesis.tex, which this program did not write"),
+        ("mixed", True, "holds events.txt, which this program did not write"),
+        ("VIDEO.MP4", False, "cannot write .MP4"),
     ]:
         with pytest.raises(OutputError, match=message):
             check_output(tmp_path / name, overwrite)
     check_output(tmp_path / "movie.mp4", overwrite=True)
+
+
+def test_a_dot_makes_no_file_of_a_folder(tmp_path):
+    for name in ("out_0.35", "run.1"):
+        check_output(tmp_path / name, overwrite=False)
+        write_video(tmp_path / name, ramp(2))
+        assert len(list((tmp_path / name).iterdir())) == 3
+
+
+def test_a_mounted_disk_is_no_output(tmp_path, monkeypatch):
+    (tmp_path / "disk").mkdir()
+    monkeypatch.setattr(Path, "is_mount", lambda path: path.name == "disk")
+    with pytest.raises(OutputError, match="choose a folder in it"):
+        check_output(tmp_path / "disk", overwrite=False)
+
+
+@pytest.mark.parametrize("suffix", ["", ".gif"])
+def test_a_link_stays_and_what_it_points_to_is_written(tmp_path, suffix):
+    target, link = tmp_path / f"target{suffix}", tmp_path / f"link{suffix}"
+    if not suffix:
+        target.mkdir()
+    link.symlink_to(target)
+    for count in (3, 2):
+        write_video(link, ramp(count))
+        assert link.is_symlink() and target.exists()
+    assert {path.name for path in tmp_path.iterdir()} == {link.name, target.name}
+
+
+def test_replacing_a_folder_minds_what_lies_beside_it(tmp_path):
+    (tmp_path / "out.old").mkdir()
+    (tmp_path / "out.old" / "mine.txt").write_text("")
+    for _ in range(2):
+        write_video(tmp_path / "out", ramp(2))
+    assert {path.name for path in tmp_path.iterdir()} == {"out", "out.old"}
+
+
+def test_times_before_zero(tmp_path):
+    writer = FolderWriter(tmp_path / "out")
+    for time in (-1_000_001, -1, 0, 1_500_000):
+        writer.write(ramp(1)[0], time)
+    writer.finish()
+    stamps = (tmp_path / "out" / "timestamps.txt").read_text().split()
+    assert stamps == ["-1.000001", "-0.000001", "0.000000", "1.500000"]
+
+
+def test_a_gif_has_a_greatest_rate(tmp_path):
+    write_video(tmp_path / "quick.gif", ramp(), fps=100)
+    with pytest.raises(OutputError, match="at most 100 pictures per second"):
+        write_video(tmp_path / "quicker.gif", ramp(), fps=120)

@@ -1,8 +1,10 @@
+import itertools
+
 import numpy as np
 import pytest
 
 from firenet_jax.events import Events, Frames, Recording, RecordingError
-from firenet_jax.windows import Windows, cut
+from firenet_jax.windows import Windows, _grid_spans, cut
 
 
 def recording_of(t, frames=None, chunk=7, height=2, width=3):
@@ -86,6 +88,25 @@ def test_between_frames(chunk):
 def test_between_frames_starts_with_the_first_event():
     recording = recording_of(range(31, 60), frames=[0, 10, 20, 30, 40, 50])
     assert [w[0] for w in times_of(recording, between_frames=True)] == [31, 40, 50]
+
+
+@pytest.mark.parametrize("duration", [33.3333, 16.6667, 8.3335])
+def test_by_duration_leaves_no_gap_and_no_overlap(duration):
+    """Of floats, k + 1 steps and k steps and a duration would round differently."""
+    spans = itertools.islice(_grid_spans(duration, duration, 7), 20_000)
+    assert all(stop == start for (_, stop), (start, _) in itertools.pairwise(spans))
+
+
+@pytest.mark.parametrize("frames, events", [((0, 100), 10**16), ((10**16, 10**16 + 100), 0)])
+def test_frames_on_another_clock_are_refused(frames, events):
+    recording = recording_of(events + np.arange(20), frames=frames)
+    with pytest.raises(RecordingError, match="memory: .*not on one clock"):
+        list(cut(recording, Windows(between_frames=True)))
+
+
+def test_frames_all_at_one_time_are_too_few():
+    with pytest.raises(RecordingError, match="each at a time of its own"):
+        cut(recording_of(range(20), frames=[5, 5, 5]), Windows(between_frames=True))
 
 
 def test_between_frames_needs_frames():

@@ -5,8 +5,9 @@
 
 Separators are spaces, tabs or commas. Times are seconds; where none of the first rows has a decimal
 point they are microseconds, and a notice says so. A line of names (`x,y,p,t`, any order, further
-columns are skipped) sets the order of the columns; Metavision's `%geometry:1280,720` sets the size
-and that program's own order. Lines are counted from 1, header included; empty lines do not matter.
+columns are skipped) sets the order of the columns and, where it tells one (`t_us`, `time [ns]`),
+the unit of the times; Metavision's `%geometry:1280,720` sets the size and that program's own order.
+Lines are counted from 1, header included; empty lines do not matter.
 
 Blocks of 2 MB go through pyarrow's parser, at 12 million events/s (8 from a zip); only a block
 that it refuses is read again in Python, to name the line.
@@ -17,11 +18,12 @@ import re
 import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 
@@ -34,11 +36,12 @@ SNIFFED = 1000  # rows from which the units are told
 BROKEN = zipfile.BadZipFile, zlib.error, EOFError, OSError  # what damaged compressed bytes raise
 
 NAMES = {
-    "t": ("t", "ts", "time", "timestamp", "timestamps", "t_us", "timestamp_us"),
+    "t": ("t", "ts", "time", "times", "timestamp", "timestamps"),
     "x": ("x", "xs"),
     "y": ("y", "ys"),
     "p": ("p", "ps", "pol", "polarity", "on"),
 }
+UNITS = {"s": 1e6, "sec": 1e6, "ms": 1e3, "us": 1.0, "µs": 1.0, "μs": 1.0, "ns": 1e-3}
 WORDS = "no one two three four five six seven eight nine ten".split()
 EXPECTED = {
     "t": ("the time", "a number of seconds"),
@@ -56,6 +59,7 @@ class Layout(NamedTuple):
     names: tuple[str, ...]  # of the columns, in their order: t, x, y, p, and _i for others
     separator: str
     types: dict[str, pa.DataType]
+    unit: float | None  # microseconds in the times' unit; None where no name says it
 
 
 def matches(path: Path) -> bool:
@@ -117,13 +121,13 @@ def _sniff(path: Path, member: str | None) -> Layout:
     lines = head.decode("utf-8-sig", "replace").split("\n")
     if len(head) == HEAD:
         lines.pop()  # cut off
-    size, names, skip = None, ("t", "x", "y", "p"), len(lines)
+    size, names, unit, skip = None, ("t", "x", "y", "p"), None, len(lines)
     for number, line in enumerate(map(str.strip, lines), 1):
         words = _words(line, "," if "," in line else " ")
         if match := re.fullmatch(r"%geometry:(\d+),(\d+)", line):
             size, names = (int(match[2]), int(match[1])), ("x", "y", "p", "t")
         elif named := _names(line.lower().lstrip("#% ")):
-            names = named
+            names, unit = named
         elif not line or line.startswith(("#", "%")):
             continue
         elif size is None and len(words) == 2 and all(map(str.isdecimal, words)):
@@ -145,19 +149,29 @@ def _sniff(path: Path, member: str | None) -> Layout:
         return not any(set(".e") & set(row[index].lower()) for row in rows if index < len(row))
 
     types = {name: pa.int32() if whole(name) else pa.float64() for name in ("x", "y", "p")}
-    types["t"] = pa.int64() if rows and whole("t") else pa.float64()
-    if types["t"] == pa.int64():
+    fine = unit in (None, UNITS["us"], UNITS["ns"])  # a whole number of seconds tells nothing
+    types["t"] = pa.int64() if rows and whole("t") and fine else pa.float64()
+    if types["t"] == pa.int64() and unit is None:
         logger.warning("%s: times without a decimal point: read as microseconds", path)
-    return Layout(skip, size, names, separator, types)
+    return Layout(skip, size, names, separator, types, unit)
 
 
-def _names(line: str) -> tuple[str, ...] | None:
-    """A line of names -> the columns' own names here; None if t, x, y, p are not all among them."""
+def _names(line: str) -> tuple[tuple[str, ...], float | None] | None:
+    """A line of names -> the columns' own names here, and the unit of the times if it is told.
+
+    None if t, x, y, p are not all among them.
+    """
     known = {name: key for key, names in NAMES.items() for name in names}
-    line = re.sub(r"\s*[\[(].*?[\])]|\"", "", line)  # units, as in `time [us]`, and quotes
-    words = _words(line, "," if "," in line else " ")
-    named = tuple(known.get(word, f"_{i}") for i, word in enumerate(words))
-    return named if all(named.count(key) == 1 for key in NAMES) else None
+    line = re.sub(r"\s*[\[(]\s*([^\s\])]*)[^\])]*[\])]", "|\\1", line.replace('"', ""))
+    named, unit = [], None
+    for i, word in enumerate(_words(line, "," if "," in line else " ")):
+        name, _, told = word.partition("|")  # what was in brackets, as in `time [us]`
+        if name not in known and name.rpartition("_")[2] in UNITS:  # as in `t_us`
+            name, _, told = name.rpartition("_")
+        key = known.get(name, f"_{i}")
+        unit = UNITS.get(told) if key == "t" else unit
+        named.append(key)
+    return (tuple(named), unit) if all(named.count(key) == 1 for key in NAMES) else None
 
 
 def _is_number(word: str) -> bool:
@@ -198,21 +212,38 @@ def _events(path: Path, member: str | None, layout: Layout) -> Iterator[Events]:
     for number, block in _blocks(path, member, layout.skip):
         if not block or block.isspace():
             continue
-        table = _parse(path, number, block, layout)
-        columns = (table[name].to_numpy() for name in "txyp")
-        yield to_events(path, 0, *columns, partial(_line, number, block))
+        for table in _parse(path, number, block, layout):
+            t, *others = (table[name].to_numpy() for name in "txyp")
+            t = _scaled(t, layout.unit)
+            yield to_events(path, 0, t, *others, partial(_line, number, block))
 
 
-def _parse(path: Path, number: int, block: bytes, layout: Layout) -> pa.Table:
-    with suppress(pa.ArrowInvalid):
-        return _table(block, layout)
-    try:  # once more with single spaces between words: rare, and it costs a third of the time
-        return _table(_tidied(block, layout.separator), layout)
+def _scaled(t: np.ndarray, unit: float | None) -> np.ndarray:
+    """Times in a unit -> microseconds where they are whole numbers, else seconds."""
+    if unit is None:
+        return t
+    if t.dtype.kind == "f":
+        return t * (unit / 1e6)
+    return t if unit == UNITS["us"] else t // 1000
+
+
+def _parse(path: Path, number: int, block: bytes, layout: Layout) -> Iterator[pa.Table]:
+    """Rows up to the first line that is none, which raises RecordingError: once they are used."""
+    try:
+        try:
+            table = _table(block, layout)
+        except pa.ArrowInvalid:
+            # once more with single spaces between words: rare, and it costs a third of the time
+            table = _table(_tidied(block, layout.separator), layout)
     except pa.ArrowInvalid as error:
-        _refuse(path, number, block, layout)
+        good, said = _fault(number, block, layout)
+        if good := b"\n".join(block.split(b"\n")[:good]).strip():
+            yield _table(_tidied(good, layout.separator), layout)
         raise RecordingError(
+            f"{path}, {said}" if said else
             f"{path}, in the lines from {number}: not rows of t x y p ({error})"
-        ) from error
+        ) from error  # fmt: skip
+    yield table
 
 
 def _table(block: bytes, layout: Layout) -> pa.Table:
@@ -236,26 +267,23 @@ def _tidied(block: bytes, separator: str) -> bytes:
     return block if separator == "," else block.replace(b" ", separator.encode())
 
 
-def _refuse(path: Path, start: int, block: bytes, layout: Layout):
-    """Raises RecordingError for the first line of the block that is no event, in Python's time."""
+def _fault(start: int, block: bytes, layout: Layout) -> tuple[int, str]:
+    """(lines before the first one that is no event, what is wrong with it), in Python's time."""
     columns = len(layout.names)
-    for number, line in enumerate(block.decode("utf-8", "replace").split("\n"), start):
-        words = _words(line.strip(), layout.separator)
+    for good, line in enumerate(block.decode("utf-8", "replace").split("\n")):
+        words, where = _words(line.strip(), layout.separator), f"line {start + good}"
         if not line.strip():
             continue
         if len(words) != columns:
-            raise RecordingError(
-                f"{path}, line {number}: {_count(len(words))} instead of "
-                f"{_count(columns, '')}: {_shown(line)}"
-            )
+            found, expected = _count(len(words)), _count(columns, "")
+            return good, f"{where}: {found} instead of {expected}: {_shown(line)}"
         for name, word in zip(layout.names, words, strict=True):
             if name in EXPECTED and not _fits(word, layout.types[name]):
                 what, expected = EXPECTED[name]
                 if name == "t" and layout.types["t"] == pa.int64():
                     expected = "whole microseconds, as in the first lines"
-                raise RecordingError(
-                    f"{path}, line {number}: {what} is {word}, expected {expected}"
-                )
+                return good, f"{where}: {what} is {word}, expected {expected}"
+    return 0, ""
 
 
 def _fits(word: str, kind: pa.DataType) -> bool:
