@@ -107,7 +107,7 @@ def checked(
             continue
         t, x, y = events.t, events.x, events.y
         last = t[0] if last is None else last
-        limits = (width or np.inf, height or np.inf)
+        limits = [np.inf if size is None else size for size in (width, height)]
         steps = np.diff(t)
         if (
             t[0] >= last
@@ -139,6 +139,19 @@ def checked(
             f"{where}: {name} is {value}, outside the sensor of {width}x{height} pixels: pass the "
             "right --sensor-size WIDTHxHEIGHT"
         )
+
+
+def until_damage(chunks: Iterable[Events]) -> Iterator[Events]:
+    """Chunks up to damage, for a first look at a recording: whoever uses it will meet the error,
+    or stop before. Raises it where there is nothing before."""
+    seen = 0
+    try:
+        for events in chunks:
+            seen += len(events)
+            yield events
+    except RecordingError:
+        if not seen:
+            raise
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:

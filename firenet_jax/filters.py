@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import median_filter
 
-from firenet_jax.events import Events, Recording, RecordingError
+from firenet_jax.events import Events, Recording, RecordingError, until_damage
 
 
 def between(chunks: Iterable[Events], start: float | None, stop: float | None) -> Iterator[Events]:
@@ -56,7 +56,7 @@ def find_hot_pixels(recording: Recording, most: int = 5_000_000) -> np.ndarray:
     """
     counts = np.zeros(recording.pixels, np.int64)
     seen = 0
-    for events in recording.events():
+    for events in until_damage(recording.events()):
         pixels = events.y.astype(np.int64) * recording.width + events.x
         counts += np.bincount(pixels, minlength=counts.size)
         seen += len(events)

@@ -192,9 +192,13 @@ def run(settings: Reconstruct) -> list[Path]:
     # Recordings have nothing to do with each other, so processes need not know of each other:
     # as one of JAX's own processes, one that is done or dies would take the others with it.
     mine = slice(settings.process or 0, None, settings.processes or 1)
-    outputs = plan(settings.recordings, settings.output)[mine]
+    planned = plan(settings.recordings, settings.output)
+    outputs = planned[mine]
     if not outputs:
         return []
+    for output in outputs:
+        if not done_file(output).is_file():
+            check_output(output, settings.overwrite)
     size = parse_size(settings.sensor_size)
     jobs = []
     for path, output in zip(settings.recordings[mine], outputs, strict=True):
@@ -227,8 +231,9 @@ def run(settings: Reconstruct) -> list[Path]:
     if failed:
         rest = "; the other recordings are done" if done else ""
         raise RecordingError("; ".join(map(str, failed.values())) + rest)
-    for output in outputs:
-        done_file(output).unlink(missing_ok=True)
+    if all(done_file(output).is_file() for output in planned):  # those of other processes too
+        for output in planned:
+            done_file(output).unlink(missing_ok=True)
     return outputs
 
 
@@ -250,12 +255,10 @@ def plan(recordings: tuple[Path, ...], output: Path) -> list[Path]:
 def _stem(path: Path) -> str:
     """The name without its suffix, nor with one before that: `a.txt.gz` -> `a`, `a.1.txt` -> `a.1`.
 
-    That of a folder is its name.
+    A folder may have a dot in its name.
     """
-    if path.is_dir():
-        return path.name
-    path = path.with_suffix("")
-    while path.suffix.lower() in OTHER_FILES:
+    path = path if path.is_dir() else path.with_suffix("")
+    while path.suffix.lower() in (*VIDEOS, *OTHER_FILES):
         path = path.with_suffix("")
     return path.name
 
@@ -265,10 +268,15 @@ def done_file(output: Path) -> Path:
     return output.with_name(f"{output.name}.done.json")
 
 
+def done_as(job: Job) -> str:
+    """What its done file says: what the output was made of, and what it is."""
+    return json.dumps([job.record, identity(job.output)])
+
+
 def is_done(job: Job) -> bool:
     """Whether an interrupted run of the same settings has left this output, one of several."""
     try:
-        return job.output.exists() and done_file(job.output).read_text() == job.record
+        return done_file(job.output).read_text() == done_as(job)
     except (OSError, UnicodeDecodeError):
         return False
 
@@ -359,11 +367,13 @@ def reconstruct_jobs(
                     failed[running.job.output] = running.error
                     open_jobs.pop(slot).writer.abandon()
                 elif part.ends:
+                    output = running.job.output
+                    done_file(output).unlink(missing_ok=True)
                     running.writer.finish()
                     if isinstance(running.writer, FolderWriter):
-                        (running.job.output / "resume.npz").unlink(missing_ok=True)
+                        (output / "resume.npz").unlink(missing_ok=True)
                     if len(settings.recordings) > 1:
-                        write_text(done_file(running.job.output), running.job.record)
+                        write_text(done_file(output), done_as(running.job))
                     del open_jobs[slot]
                 else:
                     publish_position(part)
@@ -533,7 +543,8 @@ def load_position(job: Job, settings: Reconstruct) -> tuple[int, Session]:
         unpublished.unlink()
     saved = check_position(job, settings)
     if saved is None:
-        path.unlink(missing_ok=True)
+        if path.is_file():
+            path.unlink()
         return 0, initial
     tree = jax.tree.structure(initial)
     try:

@@ -43,7 +43,7 @@ FAULTS = "mismatch", "noise", "leak", "hot", "cutoff"
 
 
 def _on(fault: float | tuple[float, float] | None) -> bool:
-    return fault is not None and fault not in (0, (0, 0))
+    return fault is not None and fault not in (0, (0, 0), [0, 0])
 
 
 @dataclass(frozen=True)

@@ -423,7 +423,7 @@ def run(settings: Train, stop: int | None = None) -> None:
             f"{jax.device_count()} devices: choose a multiple of that"
         )
     folder = settings.output
-    _same_settings(folder, settings)
+    _check_settings(folder, settings)
     state = initial_train_state(settings)
     options = ocp.CheckpointManagerOptions(max_to_keep=2)
     with ocp.CheckpointManager((folder / "checkpoints").absolute(), options=options) as saved:
@@ -432,6 +432,7 @@ def run(settings: Train, stop: int | None = None) -> None:
             logger.warning("%s: going on after step %d", folder, state.step)
         done = int(state.step)
         sources, validation = sources_of(settings, done)
+        _keep_settings(folder, settings)  # now that all is there: a failed start blocks no folder
         log = Log(folder, done)
         best, last_save = log.best(), time.monotonic()
         last = min(settings.steps, stop or settings.steps)
@@ -615,26 +616,27 @@ def _differences(found: dict, now: dict) -> list[str]:
     return said
 
 
-def _same_settings(folder: Path, settings: Train) -> None:
-    """Keeps the settings in the folder; raises ValueError if a run of others is there.
+def _check_settings(folder: Path, settings: Train) -> None:
+    """Raises ValueError if the folder holds a run of other settings.
 
     Options that the run there does not know, as it is older than they are, count as their defaults.
-    Those of `FREE` may change. Of a run that failed before its first step there is nothing to keep.
+    Those of `FREE` may change.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    text, defaults = _as_text(settings), json.loads(_as_text(Train(folder)))
     path = folder / "settings.json"
-    if path.exists():
-        try:
-            found = _filled(json.loads(path.read_text()), defaults)
-        except (ValueError, AttributeError) as error:
-            raise ValueError(f"{path} is damaged ({error}): choose another --output") from error
-        other = _differences(found, json.loads(text))
-        began = list(_entries(folder / "log.jsonl")) or any(folder.glob("checkpoints/[0-9]*"))
-        if other and (began or not _first()):
-            raise ValueError(
-                f"{folder} holds a run with other settings ({', '.join(other)}): choose another "
-                "--output, or go on with the same settings"
-            )
+    if not path.exists():
+        return
+    try:
+        found = _filled(json.loads(path.read_text()), json.loads(_as_text(Train(folder))))
+    except (ValueError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged ({error}): choose another --output") from error
+    if other := _differences(found, json.loads(_as_text(settings))):
+        raise ValueError(
+            f"{folder} holds a run with other settings ({', '.join(other)}): choose another "
+            "--output, or go on with the same settings"
+        )
+
+
+def _keep_settings(folder: Path, settings: Train) -> None:
     if _first():
-        write_text(path, text)  # other processes may be looking
+        write_text(folder / "settings.json", _as_text(settings))  # others may be looking

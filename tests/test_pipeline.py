@@ -312,6 +312,49 @@ def test_an_interrupted_run_of_several_goes_on(tmp_path, weights, monkeypatch, c
     assert {path.name for path in (tmp_path / "out").iterdir()} == set("abc")
 
 
+def test_what_is_no_longer_what_an_interrupted_run_left_is_not_taken_for_done(tmp_path, weights):
+    paths = [write_recording(tmp_path / f"{name}.txt", 900, seed=3) for name in "ab"]
+    good = paths[1].read_text()
+    paths[1].write_text(good + "0.0 1 1 1\n")
+    both, out = tuple(paths), tmp_path / "out"
+    with pytest.raises(RecordingError, match="backwards"):
+        run(settings(weights, both, out))
+    next((out / "a").glob("*.png")).unlink()
+    with pytest.raises(OutputError, match="a exists"):
+        run(settings(weights, both, out))
+    with pytest.raises(RecordingError, match="backwards"):
+        run(settings(weights, both, out, overwrite=True))
+    assert len(pictures_of(out / "a")[0]) == 9
+    paths[1].write_text(good)
+    run(settings(weights, both, out))
+    assert {path.name for path in out.iterdir()} == {"a", "b"}
+
+
+def test_processes_that_share_recordings_know_what_others_have_done(tmp_path, weights):
+    paths = tuple(write_recording(tmp_path / f"{name}.txt", 900, seed=3) for name in "abc")
+    shares = [{"processes": 2, "process": n} for n in (0, 1)]
+    run(settings(weights, paths, tmp_path / "out", **shares[0]))
+    assert (tmp_path / "out" / "a.done.json").exists()  # the other has not come yet
+    for share in shares:
+        run(settings(weights, paths, tmp_path / "out", **share))
+    assert {path.name for path in (tmp_path / "out").iterdir()} == set("abc")
+
+
+def test_what_a_killed_run_left_of_a_video_is_replaced(tmp_path, weights):
+    recording = write_recording(tmp_path / "a.txt")
+    (tmp_path / "a.partial.mp4").write_bytes(b"half")
+    run(settings(weights, (recording,), tmp_path / "a.mp4"))
+    assert (tmp_path / "a.mp4").exists() and not (tmp_path / "a.partial.mp4").exists()
+
+
+def test_the_part_before_damage_can_be_had(tmp_path, weights):
+    recording = write_recording(tmp_path / "a.txt")
+    recording.write_text(recording.read_text().split("\n", 1)[1] + "0.0 1 1 1\n")  # no size
+    for hot in (None, "auto"):
+        run(settings(weights, (recording,), tmp_path / f"{hot}", stop=0.5, hot_pixels=hot))
+        assert len(pictures_of(tmp_path / f"{hot}")[0]) > 3
+
+
 def test_the_hot_pixels_of_a_file_not_its_name_are_what_a_run_goes_on_with(
     tmp_path, weights, monkeypatch
 ):

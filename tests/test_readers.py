@@ -173,6 +173,8 @@ TEXTS = {
     "names with units": '# by hand\n"timestamp (s)", x, y, polarity\n'
     + "\n".join(ROWS).replace(" ", ","),
     "names with spaces": "# t x y p\n" + "\n".join(ROWS),
+    "a name with a unit beside": "t,x,y,p,t_ns,x_s\n"
+    + "".join(f"{row.replace(' ', ',')},7,8\n" for row in ROWS),
 }
 
 
@@ -188,17 +190,22 @@ def test_text(tmp_path, content):
 @pytest.mark.parametrize(
     "name, unit",
     [("t_us", 1), ("time [us]", 1), ("timestamp (ns)", 1e-3), ("t_ns", 1e-3), ("time_ms", 1e3),
-     ("ts [ms since start]", 1e3), ("time (s)", 1e6)],
+     ("ts [ms, since start]", 1e3), ("time (s)", 1e6), ("timestamp (nanoseconds)", 1e-3),
+     ("t_s,t_ns", 1e-3), ("t_s,t_us", 1)],
 )  # fmt: skip
 def test_text_in_the_unit_that_its_names_tell(tmp_path, caplog, name, unit, whole):
     times = T if unit <= 1 or not whole else T // unit * unit
     rows = [(t, x, y, p) for t, (_, x, y, p) in zip(times, EVENTS, strict=True)]
-    lines = [
-        f"{round(t / unit) if whole else float(t / unit)!r},{x},{y},{p}" for t, x, y, p in rows
-    ]
+    before = "0," * name.count(",t_")
+    shown = (lambda t: round(t / unit)) if whole else (lambda t: float(t / unit))
+    lines = [f"{before}{shown(t)!r},{x},{y},{p}" for t, x, y, p in rows]
     path = write(tmp_path / "a.csv", f"{name},x [px],y,p\n" + "\n".join(lines))
     np.testing.assert_array_equal(events_of(path, (240, 320)).t, times)
     assert "read as microseconds" not in caplog.text
+
+
+def test_a_sensor_of_no_pixels_is_refused(tmp_path):
+    refused(write(tmp_path / "a.txt", "0 0\n0.1 3 2 1\n"), "outside the sensor of 0x0", size=None)
 
 
 @pytest.mark.parametrize("bad", ["0.5 1 x 1", "0.5 1 2", "0.05 1 2 1", "0.5 1 999 1"])
@@ -276,6 +283,7 @@ def test_damaged_compressed_text(tmp_path):
         ("0.1 1 2 1\n0.2\n", "line 2: one word instead of four"),
         ("t,x,y,p\n.1,1,2,1\n.2,1,2,1,7\n", "line 3: five words instead of four"),
         ("0.1 1 2 1\nnan 1 2 1\n", "line 2: the time is nan"),
+        ("0.1 1 2 1\n1_0.1 1 2 1\n0.3 1 2\n", "line 2: the time is 1_0.1"),
         ("0.1 1 2 1\n\ninf 1 2 1\n", "line 3: the time is inf"),
         ("0.1 1 2 1\n0,2 1 2 1\n", "line 2: the time is 0,2, expected a number of seconds"),
         ("1 1 2 1\n0.5 1 2 1\n" * 600, "line 2"),

@@ -157,26 +157,26 @@ def test_remat_and_bfloat16_change_little(tmp_path):
 
 
 def begun(folder, settings):
-    """A run's folder after its first line of the log."""
-    train._same_settings(folder, settings)
-    (folder / "log.jsonl").write_text('{"step": 1, "kind": "train", "loss": 1.0}\n')
+    """A run's folder before its first step."""
+    train._check_settings(folder, settings)
+    train._keep_settings(folder, settings)
 
 
 def test_other_settings_do_not_continue_a_run(tmp_path):
     begun(tmp_path, tiny(tmp_path))
-    train._same_settings(tmp_path, tiny(tmp_path))
+    train._check_settings(tmp_path, tiny(tmp_path))
     with pytest.raises(ValueError, match=r"other settings \(seed was 0, now 1\)"):
-        train._same_settings(tmp_path, tiny(tmp_path, seed=1))
+        train._check_settings(tmp_path, tiny(tmp_path, seed=1))
     with pytest.raises(ValueError, match=r"\(loss.l1 was 1.0, now 0.5\)"):
-        train._same_settings(tmp_path, tiny(tmp_path, loss=Loss(l0=1, l1=0.5)))
+        train._check_settings(tmp_path, tiny(tmp_path, loss=Loss(l0=1, l1=0.5)))
     # how often it is looked at says nothing about what is computed
-    train._same_settings(tmp_path, tiny(tmp_path, log_every=7, save_every=60.0, validate_every=4))
+    train._check_settings(tmp_path, tiny(tmp_path, log_every=7, save_every=60.0, validate_every=4))
 
 
 def test_a_run_that_failed_before_its_first_step_blocks_no_folder(tmp_path):
     with pytest.raises(ValueError, match="no such folder"):
         run(tiny(tmp_path / "run", images=tmp_path / "typo"))
-    train._same_settings(tmp_path / "run", tiny(tmp_path / "run"))
+    train._check_settings(tmp_path / "run", tiny(tmp_path / "run"))
 
 
 def test_a_run_older_than_an_option_goes_on_if_that_stands_at_its_default(tmp_path):
@@ -187,11 +187,11 @@ def test_a_run_older_than_an_option_goes_on_if_that_stands_at_its_default(tmp_pa
     path.write_text(json.dumps(older))
     other = tiny(tmp_path).scene
     with pytest.raises(ValueError, match="other settings"):
-        train._same_settings(tmp_path, tiny(tmp_path, scene=replace(other, plain=0.5)))
-    train._same_settings(tmp_path, tiny(tmp_path))
+        train._check_settings(tmp_path, tiny(tmp_path, scene=replace(other, plain=0.5)))
+    train._check_settings(tmp_path, tiny(tmp_path))
     path.write_text('{"steps": 1')
     with pytest.raises(ValueError, match="settings.json is damaged"):
-        train._same_settings(tmp_path, tiny(tmp_path))
+        train._check_settings(tmp_path, tiny(tmp_path))
 
 
 def test_another_process_never_sees_half_of_the_settings(tmp_path, monkeypatch):
@@ -201,11 +201,11 @@ def test_another_process_never_sees_half_of_the_settings(tmp_path, monkeypatch):
         write(path, text[:10], **how)
         with monkeypatch.context() as other:
             other.setattr(train, "_first", lambda: False)
-            train._same_settings(tmp_path, settings)
+            train._check_settings(tmp_path, settings)
         write(path, text, **how)
 
     monkeypatch.setattr(Path, "write_text", write_with_a_look_in_between)
-    train._same_settings(tmp_path, settings)
+    train._keep_settings(tmp_path, settings)
     assert [path.name for path in tmp_path.iterdir()] == ["settings.json"]
 
 

@@ -96,6 +96,8 @@ def test_outputs_that_cannot_be(tmp_path):
     (tmp_path / "movie.mp4").write_text("")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("")
+    (tmp_path / "stills").mkdir()
+    (tmp_path / "stills" / "frame_0000000000.png").write_text("")
     write_video(tmp_path / "mixed", ramp(1))
     (tmp_path / "mixed" / "events.txt").write_text("")  # a recording, which must not be lost
     for name, overwrite, message in [
@@ -106,6 +108,7 @@ def test_outputs_that_cannot_be(tmp_path):
         ("mine", True, "holds thesis.tex, which this program did not write"),
         ("mixed", True, "holds events.txt, which this program did not write"),
         ("VIDEO.MP4", False, "cannot write .MP4"),
+        ("stills", True, "holds frame_0000000000.png, which"),
     ]:
         with pytest.raises(OutputError, match=message):
             check_output(tmp_path / name, overwrite)

@@ -29,6 +29,7 @@ from firenet_jax.events import (
     concatenate,
     event_number,
     logger,
+    until_damage,
 )
 
 # In the order in which they are asked.
@@ -87,7 +88,7 @@ def open_recording(path: str | Path, sensor_size: tuple[int, int] | None = None)
 def _infer_size(path: Path, source: Source) -> tuple[int, int]:
     """Reads all events for the largest coordinates: no file of this format names its sensor."""
     height = width = 0
-    for events in checked(source.events(), path, None, None, source.place):
+    for events in until_damage(checked(source.events(), path, None, None, source.place)):
         height = max(height, int(events.y.max()) + 1)
         width = max(width, int(events.x.max()) + 1)
     if not height:

@@ -41,7 +41,12 @@ NAMES = {
     "y": ("y", "ys"),
     "p": ("p", "ps", "pol", "polarity", "on"),
 }
-UNITS = {"s": 1e6, "sec": 1e6, "ms": 1e3, "us": 1.0, "µs": 1.0, "μs": 1.0, "ns": 1e-3}
+UNITS = {  # microseconds
+    1e6: ("s", "sec", "secs", "second", "seconds"),
+    1e3: ("ms", "msec", "millisecond", "milliseconds"),
+    1.0: ("us", "usec", "µs", "μs", "microsecond", "microseconds"),
+    1e-3: ("ns", "nsec", "nanosecond", "nanoseconds"),
+}
 WORDS = "no one two three four five six seven eight nine ten".split()
 EXPECTED = {
     "t": ("the time", "a number of seconds"),
@@ -149,7 +154,7 @@ def _sniff(path: Path, member: str | None) -> Layout:
         return not any(set(".e") & set(row[index].lower()) for row in rows if index < len(row))
 
     types = {name: pa.int32() if whole(name) else pa.float64() for name in ("x", "y", "p")}
-    fine = unit in (None, UNITS["us"], UNITS["ns"])  # a whole number of seconds tells nothing
+    fine = unit is None or unit <= 1  # of seconds, a whole number tells nothing of the next
     types["t"] = pa.int64() if rows and whole("t") and fine else pa.float64()
     if types["t"] == pa.int64() and unit is None:
         logger.warning("%s: times without a decimal point: read as microseconds", path)
@@ -162,16 +167,22 @@ def _names(line: str) -> tuple[tuple[str, ...], float | None] | None:
     None if t, x, y, p are not all among them.
     """
     known = {name: key for key, names in NAMES.items() for name in names}
-    line = re.sub(r"\s*[\[(]\s*([^\s\])]*)[^\])]*[\])]", "|\\1", line.replace('"', ""))
-    named, unit = [], None
-    for i, word in enumerate(_words(line, "," if "," in line else " ")):
-        name, _, told = word.partition("|")  # what was in brackets, as in `time [us]`
-        if name not in known and name.rpartition("_")[2] in UNITS:  # as in `t_us`
-            name, _, told = name.rpartition("_")
-        key = known.get(name, f"_{i}")
-        unit = UNITS.get(told) if key == "t" else unit
-        named.append(key)
-    return (tuple(named), unit) if all(named.count(key) == 1 for key in NAMES) else None
+    units = {name: unit for unit, names in UNITS.items() for name in names}
+    line = re.sub(r"\s*[\[(]\s*([^\s,\])]*)[^\])]*[\])]", r"|\1", line.replace('"', ""))
+    words = [word.partition("|") for word in _words(line, "," if "," in line else " ")]
+    named = [known.get(name, f"_{i}") for i, (name, _, _) in enumerate(words)]
+    told = {i: units.get(in_brackets) for i, (_, _, in_brackets) in enumerate(words)}
+    if "t" not in named:  # then `t_us`; the finest, if there are several
+        for i, (name, _, _) in enumerate(words):
+            stem, _, unit = name.rpartition("_")
+            if known.get(stem) == "t" and unit in units:
+                told[i] = units[unit]
+                if "t" not in named or told[i] < told[named.index("t")]:
+                    named = [f"_{k}" if key == "t" else key for k, key in enumerate(named)]
+                    named[i] = "t"
+    if any(named.count(key) != 1 for key in NAMES):
+        return None
+    return tuple(named), told[named.index("t")]
 
 
 def _is_number(word: str) -> bool:
@@ -179,7 +190,7 @@ def _is_number(word: str) -> bool:
         float(word)
     except ValueError:
         return False
-    return True
+    return "_" not in word  # which Python's own numbers may have
 
 
 def _words(line: str, separator: str) -> list[str]:
@@ -224,7 +235,7 @@ def _scaled(t: np.ndarray, unit: float | None) -> np.ndarray:
         return t
     if t.dtype.kind == "f":
         return t * (unit / 1e6)
-    return t if unit == UNITS["us"] else t // 1000
+    return t if unit == 1 else t // 1000
 
 
 def _parse(path: Path, number: int, block: bytes, layout: Layout) -> Iterator[pa.Table]:
