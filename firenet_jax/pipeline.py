@@ -196,7 +196,7 @@ def run(settings: Reconstruct) -> list[Path]:
     outputs = planned[mine]
     if not outputs:
         return []
-    for output in outputs:
+    for output in outputs:  # before recordings are opened: some are read whole for their size
         if not done_file(output).is_file():
             check_output(output, settings.overwrite)
     size = parse_size(settings.sensor_size)
