@@ -56,11 +56,12 @@ def reconstruct(
     Raises ValueError where the shapes of state and tensors do not belong together.
     """
     _check_shapes(state, tensors)
-    if weights.normalise:
-        tensors = normalise(tensors)
 
     def body(state, inputs):
-        new, image = step(weights.params, state, *inputs, dtype=dtype)
+        tensor, *rest = inputs
+        # Here, not for all windows at once: sums would be rounded otherwise for each T.
+        tensor = normalise(tensor) if weights.normalise else tensor
+        new, image = step(weights.params, state, tensor, *rest, dtype=dtype)
         return new if recurrent else state, image
 
     if not recurrent:
