@@ -37,13 +37,7 @@ from firenet_jax.events import Events, concatenate, parse_size
 from firenet_jax.files import OutputError, partial_name, write_text, writing
 from firenet_jax.overlap import ahead
 from firenet_jax.scenes import Scene, SceneSettings, flow, random_scene, rendering_times, video
-from firenet_jax.sensor import (
-    LONGEST,
-    SensorSettings,
-    event_list,
-    random_sensor,
-    with_faults,
-)
+from firenet_jax.sensor import LONGEST, SensorSettings, event_list, random_sensor, with_faults
 from firenet_jax.textures import load_textures
 
 ROWS = 1 << 16  # events in a chunk of the file, and so many are written at once

@@ -44,7 +44,7 @@ from firenet_jax.comparison import (
 from firenet_jax.equalise import Kind, equalise
 from firenet_jax.events import Frames, Recording, RecordingError, logger, parse_size
 from firenet_jax.files import OutputError, identity, read_arrays, write_arrays, write_text
-from firenet_jax.filters import between
+from firenet_jax.filters import between, check_span
 from firenet_jax.methods import Method, Missing, digest, load
 from firenet_jax.overlap import ahead
 from firenet_jax.readers import FORMATS, open_recording
@@ -138,12 +138,7 @@ class Evaluate:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise ValueError(f"{name} is {value}, but must be 0 or more")
-        for name in ("start", "stop"):
-            value = getattr(self, name)
-            if value is not None and not math.isfinite(value):
-                raise ValueError(f"{name} is {value} s, but must be a time: leave it out for none")
-        if self.stop is not None and self.stop <= (self.start or 0):
-            raise ValueError(f"stop is {self.stop} s, but must come after the start")
+        check_span(self.start, self.stop)
         parse_size(self.sensor_size)
 
     @property

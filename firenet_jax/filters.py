@@ -3,6 +3,7 @@
 Each filter takes and gives an iterator of `Events` chunks and never holds more than one.
 """
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,15 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from firenet_jax.events import Events, Recording, RecordingError, until_damage
+
+
+def check_span(start: float | None, stop: float | None) -> None:
+    """Raises ValueError unless these seconds, None for no bound, are a part of a recording."""
+    for name, value in (("start", start), ("stop", stop)):
+        if value is not None and not math.isfinite(value):
+            raise ValueError(f"{name} is {value} s, but must be a time: leave it out for none")
+    if stop is not None and stop <= (start or 0):
+        raise ValueError(f"stop is {stop} s, but must come after the start")
 
 
 def between(chunks: Iterable[Events], start: float | None, stop: float | None) -> Iterator[Events]:

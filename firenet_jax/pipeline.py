@@ -11,7 +11,6 @@ import dataclasses
 import hashlib
 import itertools
 import json
-import math
 import os
 import time
 from collections import deque
@@ -120,12 +119,7 @@ class Reconstruct:
             raise ValueError(f"unsharp is {self.display.unsharp}, but must be 0 or more")
         if not self.recordings:
             raise ValueError("no recording: name one or more files or folders")
-        for name in ("start", "stop"):
-            value = getattr(self, name)
-            if value is not None and not math.isfinite(value):
-                raise ValueError(f"{name} is {value} s, but must be a time: leave it out for none")
-        if self.stop is not None and self.stop <= (self.start or 0):
-            raise ValueError(f"stop is {self.stop} s, but must come after the start")
+        filters.check_span(self.start, self.stop)
         if (self.process is None) != (self.processes is None):
             raise ValueError("several processes need both of --processes and --process")
         if self.process is not None and not 0 <= self.process < self.processes:

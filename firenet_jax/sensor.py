@@ -39,9 +39,6 @@ AT_ONCE = 4  # events of a pixel in one pass over the picture: fewer passes, les
 LONGEST = 2**31 // TICKS - 1  # microseconds between two renderings
 
 
-FAULTS = "mismatch", "noise", "leak", "hot", "cutoff"
-
-
 def _on(fault: float | tuple[float, float] | None) -> bool:
     return fault is not None and fault not in (0, (0, 0), [0, 0])
 
@@ -86,7 +83,7 @@ class SensorSettings:
         for name in ("threshold_range", "refractory_range"):
             if getattr(self, name) is not None:
                 check_range(name, getattr(self, name))
-        for name in FAULTS[1:]:
+        for name in ("noise", "leak", "hot", "cutoff"):
             if _on(getattr(self, name)):
                 check_range(name, getattr(self, name))
         if _on(self.hot) and self.hot[1] > 1:
