@@ -70,7 +70,7 @@ def main():
     runs = {name: partial(method, events) for name, method in methods.items()}
     repeats = []
     for _ in range(options.repeats):
-        seconds = interleaved(runs, options.runs, rest=0.1)  # PyTorch's threads spin for a while
+        seconds = interleaved(runs, options.runs)
         repeats.append(table(seconds, "ours"))
     ratios = {
         name: sorted(row["ratio"] for rows in repeats for row in rows if row["method"] == name)

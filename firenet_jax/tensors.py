@@ -30,7 +30,7 @@ BINS = 5
 # for each event too many, against a compilation of seconds for each new size.
 CAPACITIES = tuple(2**14 * 8**k for k in range(6))
 
-BLOCK = 2**18  # events that vote at once on a CPU
+BLOCK, BLOCKS = 2**17, 8  # events that vote at once on a CPU, and how many such steps in a row
 
 
 class Packed(NamedTuple):
@@ -155,11 +155,11 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
     """
     steps, batch = packed.t_min.shape
     windows, plane = steps * batch, height * width
+    even, odd = (BINS + 1) // 2, BINS // 2  # how many bins have even numbers and odd ones
     if BINS * windows * plane >= 2**31:
         raise ValueError(
             f"{windows} windows of {width}x{height} are too many for one chunk: use a smaller one"
         )
-    places = BINS * windows * plane
 
     def vote(planes, columns):
         t, x, y, p, window = columns
@@ -168,26 +168,33 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
         since = t - packed.t_min.ravel()[window]  # int32: exact, modulo 2^32
         t_star = (BINS - 1) * since.astype(jnp.float32) / packed.duration.ravel()[window]
         seen = (0 <= x) & (x < width) & (0 <= y) & (y < height) & (window < windows)
-
-        # The triangle is not zero in two bins only, those around t*. One plane a bin, so that
-        # consecutive events, close in time, vote close in memory; one sum after the other, as
-        # joining their lists first takes a tenth longer.
         pixel = (window * height + y) * width + x
-        for bins in (jnp.floor(t_star), jnp.floor(t_star) + 1):
-            votes = jnp.where(p, 1.0, -1.0) * (1 - jnp.abs(bins - t_star))
-            place = bins.astype(jnp.int32) * (windows * plane) + pixel
-            # A place past the end is dropped; a negative one would wrap round.
-            place = jnp.where(seen & (0 <= bins) & (bins < BINS), place, places)
-            planes = planes.at[place].add(votes, mode="drop")
-        return planes, None
 
-    # A sum over segments, block by block: what a block votes stays in a CPU's cache, which is a
-    # fifth faster for a million events. Accelerators take the list as one block.
+        # The triangle is not zero in two bins only, those around t*, of which one is even and one
+        # odd: two sums that share nothing, so that a CPU runs them side by side. One plane a bin,
+        # so that consecutive events, close in time, vote close in memory.
+        sums = []
+        for first, (bins, planes_of) in enumerate(zip((even, odd), planes, strict=True)):
+            k = jnp.floor((t_star + 1 - first) / 2)  # of bins first, first + 2, ... the one near t*
+            votes = jnp.where(p, 1.0, -1.0) * (1 - jnp.abs(2 * k + first - t_star))
+            place = k.astype(jnp.int32) * (windows * plane) + pixel
+            # A place past the end is dropped; a negative one would wrap round.
+            place = jnp.where(seen & (0 <= k) & (k < bins), place, planes_of.size)
+            sums.append(planes_of.at[place].add(votes, mode="drop"))
+        return tuple(sums), None
+
+    # A sum over segments, block by block: what a block votes stays in a CPU's cache. XLA's CPU
+    # runs steps side by side only where more than eight are ready, hence several blocks in one
+    # body. Accelerators take the list as one block.
     size = packed.t.shape[0]
     block = BLOCK if jax.default_backend() == "cpu" and size % BLOCK == 0 else size
     columns = jax.tree.map(lambda column: column.reshape(-1, block), packed[:5])
-    planes, _ = jax.lax.scan(vote, jnp.zeros(places), columns)
-    return planes.reshape(BINS, steps, batch, height, width).transpose(1, 2, 3, 4, 0)
+    nothing = tuple(jnp.zeros(bins * windows * plane) for bins in (even, odd))
+    planes, _ = jax.lax.scan(vote, nothing, columns, unroll=BLOCKS)
+    planes = [sums.reshape(-1, 1, steps, batch, height, width) for sums in planes]
+    in_order = [planes[number % 2][number // 2] for number in range(BINS)]
+    # Joined, then transposed: twice as fast as jnp.stack.
+    return jnp.concatenate(in_order).transpose(1, 2, 3, 4, 0)
 
 
 def normalise(tensors: jax.Array) -> jax.Array:
