@@ -79,7 +79,7 @@ def load_weights(path: str | Path | None = None) -> Weights:
         return _load_default()
     path = Path(path)
     if path.is_dir():
-        path = path / "weights.npz"  # a training run keeps its newest weights here
+        path = path / "weights.npz"  # a training run keeps its best weights here
     if not path.is_file():
         raise CheckpointError(f"{path} does not exist or is not a file; {TRY}")
     if path.suffix in PYTORCH:

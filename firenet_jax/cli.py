@@ -101,9 +101,12 @@ def main(arguments: list[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 130
-    except (ValueError, OSError) as error:
-        if os.environ.get("FIRENET_DEBUG"):
+    except (ValueError, OSError, MemoryError, RuntimeError) as error:
+        no_room = isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
+        if os.environ.get("FIRENET_DEBUG") or (isinstance(error, RuntimeError) and not no_room):
             raise
+        if no_room:
+            error = "not enough memory: ask for a smaller sensor, chunk, crop or batch"
         print(f"firenet: error: {error}", file=sys.stderr)
         return 1
     return 0

@@ -118,8 +118,9 @@ class Numbers:
         flows = np.stack([e.flow if k else still for e, k in zip(batch, known, strict=True)])
         previous = np.concatenate([last[1][None], images[:-1]])
         previous_truths = np.concatenate([last[2][None], truths[:-1]])
+        visible = np.isfinite(flows).all(-1)  # files say nan where they know no flow
         errors = metrics.temporal_error(
-            *map(_whole, (images, previous, flows, truths, previous_truths))
+            *map(_whole, (images, previous, flows, truths, previous_truths, visible))
         ).tolist()
         return [error if k else None for error, k in zip(errors, known, strict=False)]
 

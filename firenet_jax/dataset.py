@@ -36,7 +36,15 @@ from tqdm import tqdm
 from firenet_jax.events import Events, concatenate, parse_size
 from firenet_jax.files import OutputError, partial_name, write_text, writing
 from firenet_jax.overlap import ahead
-from firenet_jax.scenes import Scene, SceneSettings, flow, random_scene, rendering_times, video
+from firenet_jax.scenes import (
+    Scene,
+    SceneSettings,
+    check_seed,
+    flow,
+    random_scene,
+    rendering_times,
+    video,
+)
 from firenet_jax.sensor import LONGEST, SensorSettings, event_list, random_sensor, with_faults
 from firenet_jax.textures import load_textures
 
@@ -48,6 +56,7 @@ TEXTURES, TEXTURE_SIZE = 64, 320
 FEW = 8  # sequences after which their mean size is that of all, more or less
 LONGEST_SCENE = 60.0  # seconds; a scene's clock is float32, which by then ticks in 4 us
 CLIP_SUFFIXES = (".h5", ".hdf5")
+OF_SCENES = ("sequences", "validation", "seconds", "fps", "images", "scene")  # not of a video
 
 
 @dataclass(frozen=True)
@@ -105,7 +114,14 @@ class Simulate:
                 f"validation is {self.validation}, but must be between 0 and the number of "
                 f"sequences, {self.sequences}"
             )
+        check_seed(self.seed)
         parse_size(self.sensor_size)
+        if self.video is not None:
+            idle = [name for name in OF_SCENES if getattr(self, name) != getattr(Simulate, name)]
+            if idle:
+                raise ValueError(
+                    f"{', '.join(idle)}: no part in turning a video into events: leave it out"
+                )
 
 
 class Picture(NamedTuple):
@@ -249,6 +265,13 @@ def run(settings: Simulate) -> list[Path]:
         for part, (name, count) in enumerate(split.items())
         for number in range(count)
     ]
+    for name, count in split.items():
+        there = len(list((settings.output / name).glob("??????.h5")))
+        if there > count:
+            raise OutputError(
+                f"{settings.output / name} holds {there} sequences already, but these settings "
+                f"want {count}: ask for as many --sequences and --validation or more"
+            )
     missing = [entry for entry in work if not entry[0].exists()]
     events = used = 0
     with tqdm(
@@ -436,7 +459,8 @@ def simulate_clip(settings: Simulate) -> Path:
                 yield picture.time, picture.image.astype(np.float32) / 255
                 progress.update()
 
-    record = describe(settings) | {"video": clip.name, "sensor_size": f"{width}x{height}"}
+    record = {k: v for k, v in describe(settings).items() if k not in OF_SCENES}
+    record |= {"video": clip.name, "sensor_size": f"{width}x{height}"}
     count = write_sequence(
         path,
         ahead(event_list(camera, renderings()), depth=4),

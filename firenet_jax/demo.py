@@ -25,10 +25,10 @@ from firenet_jax.network import Weights, initial_state
 from firenet_jax.overlap import ahead
 from firenet_jax.pictures import Display, display, event_pictures, initial_display_state
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.scenes import Scene, SceneSettings, random_scene
+from firenet_jax.scenes import Scene, SceneSettings, check_seed, random_scene
 from firenet_jax.sensor import FAULTY, Sensor, SensorSettings, random_sensor, simulate
 from firenet_jax.textures import HELD_OUT, load_textures, photographs
-from firenet_jax.video import check_output, open_writer
+from firenet_jax.video import check_output, followed, open_writer
 
 WINDOWS = 10  # simulated and reconstructed at once
 RENDERINGS = 5  # in a window, with at most half a pixel of motion between two
@@ -71,6 +71,7 @@ class Demo:
             raise ValueError(f"fps is {self.fps}, but must be between 1 and 1000")
         if self.seconds * self.fps < 1:
             raise ValueError(f"{self.seconds} s at {self.fps} pictures per second hold no picture")
+        check_seed(self.seed)
         height, width = parse_size(self.sensor_size)
         if min(height, width) < 16:
             raise ValueError(f"a sensor of {width}x{height}: expected 16x16 or more")
@@ -89,12 +90,13 @@ def run(settings: Demo) -> dict[str, float]:
     """Does what the settings say; returns the numbers it prints. Raises CheckpointError,
     OutputError or ValueError with a message of one sentence."""
     weights = load_weights(settings.weights)
-    check_output(settings.output, settings.overwrite)
+    output = followed(settings.output)
+    check_output(output, settings.overwrite)
     height, width = parse_size(settings.sensor_size)
     count = max(round(settings.seconds * settings.fps), 1)
     period = 1e6 / settings.fps
     sensor, scene = make_scene(settings, height, width)
-    writer = open_writer(settings.output, settings.fps)
+    writer = open_writer(output, settings.fps)
     errors = np.zeros(3)
     warm_up = min(WARM_UP, count - 1)
     shown = ahead(pictures(weights, sensor, scene, count, period, height, width), depth=1)
@@ -113,11 +115,13 @@ def run(settings: Demo) -> dict[str, float]:
         shown.close()
     values = (errors / (count - warm_up)).tolist()
     result = dict(zip(("mse", "ssim", "temporal_error"), values, strict=True))
+    if count == 1:  # a first picture has no predecessor
+        del result["temporal_error"]
+    temporal = f", temporal error {result['temporal_error']:.4f}" if count > 1 else ""
     print(
         f"{settings.output}: {count} pictures of {width}x{height} pixels\n"
-        f"  MSE {result['mse']:.4f}, SSIM {result['ssim']:.3f}, temporal error "
-        f"{result['temporal_error']:.4f}: means over {count - warm_up} pictures, after "
-        f"{warm_up} of warm-up\n"
+        f"  MSE {result['mse']:.4f}, SSIM {result['ssim']:.3f}{temporal}: "
+        f"means over {count - warm_up} pictures, after {warm_up} of warm-up\n"
         "  (intensities 0 to 1, not equalised; SSIM: Gaussian window of sigma 1.5, data range 1)"
     )
     return result
@@ -162,7 +166,7 @@ def pictures(
         )  # fmt: skip
         state, images = reconstruct(weights, state, simulated.tensors)
         images = images[:, 0]
-        if last is None:  # the first picture has no predecessor; it belongs to the warm-up
+        if last is None:  # the first picture has no predecessor, so its temporal error is none
             last = images[0], simulated.images[0, 0]
         last, shown = _show(simulated, images, last)
         shown = jax.device_get(shown)

@@ -43,9 +43,16 @@ from firenet_jax.comparison import (
 )
 from firenet_jax.equalise import Kind, equalise
 from firenet_jax.events import Frames, Recording, RecordingError, logger, parse_size
-from firenet_jax.files import OutputError, identity, read_arrays, write_arrays, write_text
+from firenet_jax.files import (
+    OutputError,
+    identity,
+    named,
+    read_arrays,
+    write_arrays,
+    write_text,
+)
 from firenet_jax.filters import between, check_span
-from firenet_jax.methods import Method, Missing, digest, load
+from firenet_jax.methods import NAMES, Method, Missing, digest, load
 from firenet_jax.overlap import ahead
 from firenet_jax.readers import FORMATS, open_recording
 from firenet_jax.readers.hdf5 import opened
@@ -128,7 +135,11 @@ class Evaluate:
 
     def __post_init__(self):
         if not self.data:
-            raise ValueError("no data: name one or more recordings, or folders of them")
+            raise ValueError(
+                "no data: name one or more recordings, or folders of them, before the options"
+            )
+        if not self.method_names:
+            raise ValueError(f"no methods: choose from {', '.join(NAMES)}")
         Windows(events=self.events, duration=self.duration)  # refuses numbers that cannot be
         if not 0 < self.keep_ratio <= 1:
             raise ValueError(f"keep ratio is {self.keep_ratio}, but is a share, 0 to 1")
@@ -140,6 +151,10 @@ class Evaluate:
                 raise ValueError(f"{name} is {value}, but must be 0 or more")
         check_span(self.start, self.stop)
         parse_size(self.sensor_size)
+
+    @property
+    def method_names(self) -> list[str]:
+        return [name.strip() for name in self.methods.split(",") if name.strip()]
 
     @property
     def between_frames(self) -> bool:
@@ -155,7 +170,7 @@ def run(settings: Evaluate) -> dict:
     CheckpointError, OutputError or ValueError with a message of one sentence."""
     sequences = find_sequences(settings.data)
     methods = load(
-        [name.strip() for name in settings.methods.split(",") if name.strip()],
+        settings.method_names,
         settings.weights,
         settings.e2vid_weights,
         e2vid_random=settings.e2vid_random,
@@ -225,7 +240,7 @@ def find_sequences(paths: tuple[Path, ...]) -> dict[str, Path]:
             if not inside:
                 raise RecordingError(f"{path}: holds no recordings: name files or other folders")
         for recording in inside:
-            parts = [path.resolve().name, *recording.relative_to(path).parts]
+            parts = [named(path).name, *recording.relative_to(path).parts]
             if recording.is_file():
                 parts[-1] = Path(parts[-1]).stem
             name = "-".join(parts)
@@ -295,7 +310,7 @@ def plan(name: str, recording: Recording, settings: Evaluate) -> Plan:
 def interval(path: Path, settings: Evaluate) -> tuple[float, float]:
     """Seconds from the sequence's beginning: what counts."""
     if settings.start is None and settings.stop is None:
-        name = path.resolve().name if path.is_dir() else path.stem
+        name = named(path).name if path.is_dir() else path.stem
         return CUTS.get(name, (0.0, math.inf))
     return settings.start or 0.0, math.inf if settings.stop is None else settings.stop
 

@@ -15,6 +15,8 @@ import numpy as np
 
 logger = logging.getLogger("firenet_jax")
 
+LARGEST = 2**15  # pixels of a sensor's side: coordinates are int16
+
 
 class RecordingError(ValueError):
     """A recording cannot be used; the message is one sentence: file, place, found, what to do."""
@@ -161,4 +163,6 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise ValueError(f"sensor size {text!r}: expected WIDTHxHEIGHT, such as 240x180")
+    if max(int(width), int(height)) > LARGEST:
+        raise ValueError(f"sensor size {text}: a side is at most {LARGEST} pixels")
     return int(height), int(width)

@@ -14,6 +14,11 @@ class OutputError(ValueError):
     """A file cannot be written as asked; the message is one sentence."""
 
 
+def named(path: Path) -> Path:
+    """What the user calls it: a link by its own name, `.` and `..` by theirs."""
+    return path.resolve() if path.name in ("", "..") else path
+
+
 def partial_name(path: Path) -> Path:
     """Where an output is made: `video.mp4` -> `video.partial.mp4`, `out` -> `out.partial`."""
     return path.with_name(f"{path.stem}.partial{path.suffix}")

@@ -22,6 +22,7 @@ import numpy as np
 from firenet_jax.baselines import e2vid, high_pass, manifold
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.events import logger
+from firenet_jax.files import named
 from firenet_jax.network import Weights, initial_state
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.tensors import normalise, pack, voxelise
@@ -67,14 +68,18 @@ def load(
     weights: files of FireNet or FireNet+, each a method named by its stem; without any, those of
     the package. e2vid_random: where no file is named, random weights: for measuring time.
     e2vid_sigmoid: False for E2VID+. A method without weights is `Missing`.
-    Raises ValueError for unknown and repeated names, CheckpointError for files that cannot be read.
+    Raises ValueError for unknown and repeated names and for weights of methods that are not named,
+    CheckpointError for files that cannot be read.
     """
+    for name, given in (("firenet", weights), ("e2vid", e2vid_weights)):
+        if given and name not in names:
+            raise ValueError(f"weights are given, but {name} is not among the methods: add it")
     found: list[Method | Missing] = []
     for name in names:
         if name not in NAMES:
             raise ValueError(f"no method {name!r}: choose from {', '.join(NAMES)}")
         if name == "firenet" and weights:
-            found += [firenet(path.resolve().stem, load_weights(path)) for path in weights]
+            found += [firenet(named(path).stem, load_weights(path)) for path in weights]
         elif name == "firenet":
             found.append(firenet(name, load_weights()))
         elif name == "e2vid" and e2vid_weights is not None:

@@ -31,6 +31,7 @@ from firenet_jax.events import Events, Recording, RecordingError, logger, parse_
 from firenet_jax.files import (
     OutputError,
     identity,
+    named,
     partial_name,
     read_arrays,
     write_text,
@@ -48,12 +49,14 @@ from firenet_jax.video import (
     FolderWriter,
     VideoWriter,
     check_output,
+    check_rate,
     followed,
     open_writer,
 )
 from firenet_jax.windows import Window, Windows, cut
 
-# Settings that the pictures do not depend on, or that are told in another way.
+# Settings that the pictures do not depend on (on the chunk only in float32's last bits), or that
+# are told in another way.
 ELSEWHERE = ("recordings", "output", "weights", "fps", "chunk", "batch", "overwrite")
 ELSEWHERE += ("processes", "process")
 RESUME_EVERY = 5.0  # seconds between two saves of what a resumed run needs
@@ -109,7 +112,8 @@ class Reconstruct:
     """Which one this is, from 0."""
 
     def __post_init__(self):
-        for name in ("chunk", "batch", "fps"):
+        check_rate(self.output, self.fps)
+        for name in ("chunk", "batch"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"{name} is {value}, but must be more than 0")
@@ -235,7 +239,7 @@ def plan(recordings: tuple[Path, ...], output: Path) -> list[Path]:
     """The name of each recording's output: `output` itself if there is only one recording."""
     if len(recordings) == 1:
         return [followed(output)]
-    stems = [_stem(path.resolve()) for path in recordings]
+    stems = [_stem(named(path)) for path in recordings]
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
     if twice:
         raise OutputError(

@@ -41,6 +41,12 @@ def check_range(name: str, bounds: tuple[float, float]) -> None:
         )
 
 
+def check_seed(seed: int) -> None:
+    """Raises ValueError unless jax, numpy and grain all take it."""
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"seed is {seed}, but must be 0 or more, and less than 2^32")
+
+
 @dataclass(frozen=True)
 class SceneSettings:
     """What random scenes look like. Pairs are (least, greatest).

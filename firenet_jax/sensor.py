@@ -34,9 +34,14 @@ from firenet_jax.scenes import Scene, SceneSettings, check_range, flow, random_s
 from firenet_jax.tensors import BINS
 
 EPS = 0.001
+THRESHOLD, SPREAD, REFRACTORY = 0.18, 0.03, 1e-3  # as in the paper, where nothing is said
 TICKS = 1024  # in a microsecond
 AT_ONCE = 4  # events of a pixel in one pass over the picture: fewer passes, less memory traffic
 LONGEST = 2**31 // TICKS - 1  # microseconds between two renderings
+
+
+def _or(said: float | None, default: float) -> float:
+    return default if said is None else said
 
 
 def _on(fault: float | tuple[float, float] | None) -> bool:
@@ -52,17 +57,18 @@ class SensorSettings:
     Raises ValueError for numbers that no sensor has.
     """
 
-    threshold: float = 0.18
-    """Mean of the contrast thresholds, in log intensity."""
-    threshold_spread: float = 0.03
-    """Standard deviation of the thresholds, ON and OFF each drawn once for a sequence."""
+    threshold: float | None = None
+    """Mean of the contrast thresholds, in log intensity; 0.18 where nothing is said."""
+    threshold_spread: float | None = None
+    """Standard deviation of the thresholds, ON and OFF each drawn once for a sequence; 0.03 where
+    nothing is said."""
     threshold_range: tuple[float, float] | None = None
     """Draw the ON threshold log-uniformly from here instead, and OFF about as large."""
     asymmetry: float = 0.1
     """Standard deviation of OFF in parts of ON, where they are drawn from `threshold_range`: a
     pixel that was darker for a while does not count back to where it was."""
-    refractory: float = 1e-3
-    """Seconds after an event in which a pixel stays silent."""
+    refractory: float | None = None
+    """Seconds after an event in which a pixel stays silent; 0.001 where nothing is said."""
     refractory_range: tuple[float, float] | None = None
     """Draw it log-uniformly from here instead, once for a sequence."""
     mismatch: float | None = None
@@ -88,7 +94,7 @@ class SensorSettings:
                 check_range(name, getattr(self, name))
         if _on(self.hot) and self.hot[1] > 1:
             raise ValueError(f"hot is {self.hot}, but is a part of the pixels: at most 1")
-        if not (self.threshold > 0 and math.isfinite(self.threshold)):
+        if self.threshold is not None and not 0 < self.threshold < math.inf:
             raise ValueError(f"threshold is {self.threshold}, but must be more than 0")
         for name in ("threshold_spread", "asymmetry", "refractory", "mismatch", "cutoff_dark"):
             value = getattr(self, name)
@@ -100,8 +106,7 @@ class SensorSettings:
             ("threshold_spread", "threshold_range"),
             ("refractory", "refractory_range"),
         ):
-            default = SensorSettings.__dataclass_fields__[name].default
-            if getattr(self, owner) is not None and getattr(self, name) != default:
+            if None not in (getattr(self, owner), getattr(self, name)):
                 raise ValueError(
                     f"{name} plays no part beside {owner}: "
                     f"pass --{owner.replace('_', '-')} None too"
@@ -182,7 +187,8 @@ def random_sensor(
         return jnp.exp(low + (high - low) * next(numbers))
 
     if settings.threshold_range is None:
-        on, off = settings.threshold + settings.threshold_spread * spread
+        mean, deviation = _or(settings.threshold, THRESHOLD), _or(settings.threshold_spread, SPREAD)
+        on, off = mean + deviation * spread
     else:
         on = log_uniform(settings.threshold_range)
         off = on * (1 + settings.asymmetry * spread[0])
@@ -200,7 +206,8 @@ def random_sensor(
         if _on(settings.hot):
             rate = 10.0 * 50.0**rate * jnp.where(sign < 0.5, on, -off)
             drift = jnp.where(chance < log_uniform(settings.hot), rate, drift)
-    refractory = jnp.float32(settings.refractory) if settings.refractory else None
+    refractory = _or(settings.refractory, REFRACTORY)
+    refractory = jnp.float32(refractory) if refractory else None
     if settings.refractory_range is not None:
         refractory = log_uniform(settings.refractory_range)
     return Sensor(

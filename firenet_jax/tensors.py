@@ -6,8 +6,8 @@ Event tensors are (T, B, H, W, bins) float32: T windows in time order, B recordi
     E(x, y, t_n) = sum_i p_i max(0, 1 - |t_n - t*_i|)
     t*_i = (bins - 1) (t_i - t_min) / (t_max - t_min)
 
-Windows are ragged: they travel as one flat, padded list of events and one segment_sum builds the
-tensors of all. Only the list's length is padded, to a few fixed sizes, so nothing recompiles as
+Windows are ragged: they travel as one flat, padded list of events, and sums over its segments build
+the tensors of all. Only the list's length is padded, to a few fixed sizes, so nothing recompiles as
 data flows.
 """
 

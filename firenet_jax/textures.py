@@ -78,13 +78,15 @@ def _pictures(folder: Path) -> list[Path]:
         Path(at) / name
         for at, _, names in os.walk(folder)
         for name in names
-        if name.lower().endswith(SUFFIXES) and name.lower() not in held_out
+        if name.lower().endswith(SUFFIXES)
     ]
-    if not found:
+    kept = [path for path in found if path.name.lower() not in held_out]
+    if not kept:
+        but = f" but {found[0].name}, which is held out for testing" if found else ""
         raise ValueError(
-            f"{folder}: holds no pictures ({', '.join(SUFFIXES)}): name a folder that does"
+            f"{folder}: holds no pictures ({', '.join(SUFFIXES)}){but}: name a folder that does"
         )
-    return sorted(found)
+    return sorted(kept)
 
 
 def _cuttings(rng, paths: list[Path], count: int, size: int, source) -> list[np.ndarray]:
@@ -139,8 +141,8 @@ def _grey(picture: Image.Image) -> Image.Image:
         values = np.asarray(picture)
         if values.min() < 0 or values.max() >= 2**16:
             raise ValueError("its values are not those of 8 or 16 bits")
-        deep = picture.mode != "I" or values.max() > 255  # "I" is 32 bits, of which few are used
-        return Image.fromarray((values >> 8 if deep else values).astype(np.uint8))
+        unused = max(int(values.max()).bit_length() - 8, 0)  # cameras keep 10 or 12 bits in 16
+        return Image.fromarray((values >> unused).astype(np.uint8))
     return picture.convert("L")
 
 

@@ -60,7 +60,7 @@ from firenet_jax.files import write_text
 from firenet_jax.losses import Loss, sequence_loss
 from firenet_jax.network import State, Weights, initial_params, initial_state, step
 from firenet_jax.pictures import event_pictures
-from firenet_jax.scenes import SceneSettings, check_range
+from firenet_jax.scenes import SceneSettings, check_range, check_seed
 from firenet_jax.sensor import (
     FAULTY,
     SensorSettings,
@@ -177,6 +177,7 @@ class Train:
                 f"crop is {self.crop} pixels, but images smaller than {SMALLEST} cannot be judged"
             )
         check_range("motion", self.motion)
+        check_seed(self.seed)
         if not 0 <= self.procedural <= 1:
             raise ValueError(f"procedural is {self.procedural}, but is a part of the textures, 0-1")
         if not 0 <= self.warmup < self.steps:
@@ -622,6 +623,8 @@ def _check_settings(folder: Path, settings: Train) -> None:
     Options that the run there does not know, as it is older than they are, count as their defaults.
     Those of `FREE` may change.
     """
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file, but a run needs a folder: choose another --output")
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "settings.json"
     if not path.exists():

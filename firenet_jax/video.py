@@ -27,7 +27,10 @@ OTHER_FILES = (
     ".txt", ".csv", ".json", ".raw", ".dat", ".bin", ".es", ".aedat", ".aedat4",
     ".bag", ".db3", ".mcap",
 )  # fmt: skip
-OURS = re.compile(r"timestamps\.txt|resume\.npz|frame_\d{10,}\.png")  # in a folder of pictures
+PICTURE = re.compile(r"frame_(\d{10,})\.png")
+# What is ours in a folder of pictures.
+OURS = re.compile(rf"timestamps\.txt|resume[.\w]*\.npz|{PICTURE.pattern}")
+RATES = 0.01, 10_000  # pictures per second
 GIF_RATE = 100  # pictures per second, the most that the format can say
 PNG_LEVEL = 4  # on grey pictures 25 % faster than the default 6, files 2 % larger
 
@@ -40,7 +43,19 @@ def followed(path: Path) -> Path:
         target = path.resolve()
     except (OSError, RuntimeError) as error:
         raise OutputError(f"{path}: points to itself: choose another output") from error
-    return target if target.suffix == path.suffix or target.is_dir() else path
+    folder = target.is_dir() and path.suffix not in VIDEOS
+    return target if target.suffix == path.suffix or folder else path
+
+
+def check_rate(path: Path, fps: float) -> None:
+    """Raises OutputError unless an output can show so many pictures per second."""
+    if path.suffix == ".gif" and GIF_RATE < fps <= RATES[1]:
+        raise OutputError(
+            f"{path}: a gif shows at most {GIF_RATE} pictures per second, not {fps:g}: choose "
+            "a smaller --fps or .mp4"
+        )
+    if not RATES[0] <= fps <= RATES[1]:
+        raise OutputError(f"fps is {fps:g}, but must be between {RATES[0]:g} and {RATES[1]:g}")
 
 
 def check_output(path: Path, overwrite: bool) -> None:
@@ -58,6 +73,20 @@ def check_output(path: Path, overwrite: bool) -> None:
         raise OutputError(f"{path} exists: choose another output or pass --overwrite")
     if path.is_dir() and path.is_mount():
         raise OutputError(f"{path} is a disk of its own: choose a folder in it")
+    if path.is_dir() and Path.cwd().is_relative_to(path.resolve()):
+        raise OutputError(f"{path} is the folder that you are in: choose a folder in it")
+    begun = partial_name(path)
+    if path.suffix not in VIDEOS and begun.exists():
+        strange = (
+            []
+            if not begun.is_dir()
+            else [entry.name for entry in begun.iterdir() if not OURS.fullmatch(entry.name)]
+        )
+        if strange or not begun.is_dir():
+            raise OutputError(
+                f"{begun}{f' holds {min(strange)}, which' if strange else ''} is not of an earlier "
+                "run: remove it or choose another output"
+            )
     if occupied and path.is_dir():
         names = [entry.name for entry in path.iterdir()]
         strange = [name for name in names if not OURS.fullmatch(name)]
@@ -108,9 +137,10 @@ class FolderWriter:
     def finish(self) -> None:
         with writing(self.path):
             self.stamps.close()
-            for extra in self.partial.glob("frame_*.png"):  # of a longer run before this one
-                if int(extra.stem.removeprefix("frame_")) >= self.count:
-                    extra.unlink()
+            for file in self.partial.iterdir():
+                picture = PICTURE.fullmatch(file.name)
+                if picture and int(picture[1]) >= self.count:  # of a longer run before this one
+                    file.unlink()
             old = None
             if self.path.exists() and any(self.path.iterdir()):
                 old = Path(tempfile.mkdtemp(prefix=f"{self.path.name}.old.", dir=self.path.parent))
@@ -130,11 +160,7 @@ class VideoWriter:
 
     def __init__(self, path: Path, fps: float):
         self.path, self.partial = path, partial_name(path)
-        if path.suffix == ".gif" and fps > GIF_RATE:
-            raise OutputError(
-                f"{path}: a gif shows at most {GIF_RATE} pictures per second, not {fps:g}: choose "
-                "a smaller --fps or .mp4"
-            )
+        check_rate(path, fps)
         self.rate = Fraction(fps).limit_denominator(1000)
         self.count = 0
         with writing(path):
@@ -213,6 +239,7 @@ def write_video(path: str | Path, pictures: Iterable[np.ndarray], fps: float = 3
     Raises OutputError for another suffix or a name that cannot be written.
     """
     path = followed(Path(path))
+    check_rate(path, fps)
     check_output(path, overwrite=True)
     writer = open_writer(path, fps)
     try:

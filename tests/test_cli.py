@@ -6,6 +6,7 @@ import pickle
 import re
 import subprocess
 import sys
+from unittest.mock import Mock
 
 import h5py
 import jax
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from test_pipeline import write_recording
 
-from firenet_jax import cli
+from firenet_jax import cli, info
 from firenet_jax.checkpoint import save_weights
 from firenet_jax.network import Weights, initial_params
 
@@ -45,7 +46,8 @@ def test_help_and_version(capsys):
         with pytest.raises(SystemExit) as stop:
             cli.main([command, "--help"])
         assert stop.value.code == 0
-        assert f"firenet {command} " in capsys.readouterr().out  # an example
+        _, _, examples = capsys.readouterr().out.partition("Examples:")
+        assert f"firenet {command} " in examples
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only glibc has this setting")
@@ -142,6 +144,19 @@ def test_bad_recordings_give_one_sentence_and_no_output(here, capsys, command):
         assert len(said) == 1 and said[0].startswith("firenet: error: "), (name, error)
         assert name in said[0] and place in said[0], (name, error)
         assert not (here / "out").exists()
+
+
+@pytest.mark.parametrize("kind", [MemoryError, RuntimeError])
+def test_too_little_memory_is_one_sentence(here, capsys, monkeypatch, kind):
+    def run(settings):
+        raise kind("RESOURCE_EXHAUSTED: out of memory")
+
+    monkeypatch.setattr(info, "run", run)
+    code, _, error = firenet(capsys, "info a.txt")
+    assert code == 1 and error.startswith("firenet: error: not enough memory: ")
+    with pytest.raises(RuntimeError, match="a fault of ours"):  # is not hidden
+        monkeypatch.setattr(info, "run", Mock(side_effect=RuntimeError("a fault of ours")))
+        firenet(capsys, "info a.txt")
 
 
 def test_a_sensor_size_that_is_too_small(here, capsys):

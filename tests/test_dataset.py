@@ -254,6 +254,8 @@ def test_a_run_with_more_sequences_adds_the_others(tmp_path, capsys):
     run(settings(tmp_path, sequences=1, validation=0))
     run(settings(tmp_path, sequences=3, validation=1))
     assert "2 are new" in capsys.readouterr().out.splitlines()[-1]
+    with pytest.raises(OutputError, match="validation holds 1 sequences already, .* want 0"):
+        run(settings(tmp_path, sequences=3, validation=0))
 
 
 def test_one_in_twenty_is_for_validation(tmp_path, monkeypatch):
@@ -322,6 +324,9 @@ def test_a_clip_becomes_the_events_of_its_log_intensity(tmp_path, capsys):
                                   abs=20)  # fmt: skip
     with h5py.File(out) as file:
         assert "flow" not in file and file.attrs["num_flow"] == 0
+        made_from = json.loads(file.attrs["settings"])
+    assert made_from["sensor"]["threshold"] == 0.2 and made_from["video"] == clip.name
+    assert not {"seconds", "fps", "images", "scene"} & set(made_from)
     assert "events of 32x24 pixels" in capsys.readouterr().out
     assert cli.main(line.split()) == 1  # exists
     assert cli.main([*line.split(), "--overwrite", "--sensor-size", "16x12"]) == 0
@@ -393,6 +398,9 @@ def test_everything_wrong_is_one_sentence(tmp_path, monkeypatch, capsys):
         ("-o new --sequences 0", "sequences is 0"),
         ("-o new --validation 2000", "validation is 2000"),
         ("-o new --sensor-size big", "sensor size 'big'"),
+        ("-o new --sensor-size 40000x16", "at most 32768"),
+        ("-o new --seed -1", "seed is -1"),
+        ("-o new.h5 --video clip.mp4 --fps 5 --objects 7", "fps, scene: no part in turning"),
     ],
 )
 def test_settings_that_cannot_be_are_said(capsys, line, expected):

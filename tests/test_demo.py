@@ -39,6 +39,19 @@ def test_writes_events_reconstruction_and_truth_side_by_side(tmp_path, weights, 
     assert not list(tmp_path.glob("*partial*"))
 
 
+def test_a_single_picture_has_no_temporal_error(tmp_path, weights, capsys):
+    result = run(Demo(tmp_path / "demo.mp4", weights, **SMALL | {"seconds": 0.04}))
+    assert set(result) == {"mse", "ssim"} and "temporal" not in capsys.readouterr().out
+
+
+def test_a_link_stays_and_what_it_points_to_is_written(tmp_path, weights):
+    target, link = tmp_path / "target", tmp_path / "link"
+    target.mkdir()
+    link.symlink_to(target)
+    run(Demo(link, weights, **SMALL))
+    assert link.is_symlink() and len(list(target.glob("frame_*.png"))) == 15
+
+
 def test_the_same_seed_gives_the_same(tmp_path, weights):
     results = [run(Demo(tmp_path / f"{n}.mp4", weights, seed=n // 2, **SMALL)) for n in range(3)]
     assert results[0] == results[1] != results[2]
@@ -90,6 +103,8 @@ def test_everything_wrong_is_one_sentence(tmp_path, weights, monkeypatch, capsys
         ("-o demo.mp4 --seconds 0.01", "hold no picture"),
         ("-o demo.mp4 --sensor-size 8x8", "expected 16x16"),
         ("-o demo.mp4 --sensor-size big", "sensor size 'big'"),
+        ("-o demo.mp4 --sensor-size 40000x16", "at most 32768"),
+        ("-o demo.mp4 --seed -1", "seed is -1"),
     ],
 )
 def test_settings_that_cannot_be_are_said(capsys, line, expected):

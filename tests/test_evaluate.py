@@ -4,6 +4,7 @@ import csv
 import json
 from html.parser import HTMLParser
 
+import h5py
 import jax
 import numpy as np
 import pytest
@@ -68,7 +69,9 @@ def folder(tmp_path_factory):
 
 
 def settings(folder, output, **changes):
-    standard = {"data": (folder / "data",), "weights": (folder / "ours.npz",), "e2vid_random": True}
+    standard = {"data": (folder / "data",), "e2vid_random": True}
+    if "firenet" in changes.get("methods", "firenet"):
+        standard["weights"] = (folder / "ours.npz",)
     return Evaluate(output=output, **(standard | changes))
 
 
@@ -362,6 +365,24 @@ def test_gaps_have_names_and_the_rest_is_measured(folder, tmp_path, capsys):
     assert results["means"]["over sequences"]["e2vid"] == {"gap": "no weights"}
 
 
+def test_pixels_whose_flow_is_not_known_do_not_count(folder, tmp_path):
+    """They may be anything, nan too; the others keep their weight in a mean over all pixels."""
+    for name in ("whole", "part"):
+        write(tmp_path / name / "a.h5", 6)
+    with h5py.File(tmp_path / "part" / "a.h5", "r+") as file:
+        file["flow/flow000000003"][:, 8:10] = np.nan
+    found = {
+        name: run(settings(folder, tmp_path / f"{name}-out", data=(tmp_path / name,), methods="hf"))
+        for name in ("whole", "part")
+    }
+    whole, part = (found[n]["sequences"][f"{n}-a"]["methods"]["hf"] for n in ("whole", "part"))
+    assert part["gaps"] == whole["gaps"]
+    a, b = (np.array(found["values"]["temporal_error"][1:]) for found in (part, whole))
+    numbers = np.array(part["frame_numbers"][1:])
+    np.testing.assert_array_equal(a < b, numbers == 3)
+    np.testing.assert_array_equal(a == b, numbers != 3)
+
+
 def test_frames_of_another_size_and_nothing_at_all(folder, tmp_path):
     ours = settings(folder, tmp_path / "out", methods="hf", sensor_size="30x20")
     with pytest.raises(ValueError, match="frames are 28x20, the sensor is 30x20"):
@@ -382,6 +403,9 @@ def test_weights_that_are_not_there_or_not_finite(folder, tmp_path):
     with pytest.raises(ValueError, match="two methods are named hf"):
         load(["hf", "hf"])
     assert load(["e2vid"]) == [Missing("e2vid", "no weights")]
+    for name, files in (("firenet", {"weights": ["a.npz"]}), ("e2vid", {"e2vid_weights": "a.pth"})):
+        with pytest.raises(ValueError, match=f"{name} is not among the methods"):
+            load(["hf"], **files)
 
     params = initial_params(jax.random.key(0))
     params["prediction"]["bias"] = params["prediction"]["bias"] + 3e38
@@ -397,7 +421,8 @@ def test_weights_that_are_not_there_or_not_finite(folder, tmp_path):
 @pytest.mark.parametrize(
     "choice, message",
     [
-        ({"data": ()}, "no data"), ({"keep_ratio": 0.0}, "keep ratio"),
+        ({"data": ()}, "no data"), ({"methods": " ,"}, "no methods: choose from firenet"),
+        ({"keep_ratio": 0.0}, "keep ratio"),
         ({"warm_up": -1.0}, "warm_up"), ({"tolerance": float("nan")}, "tolerance"),
         ({"start": 3.0, "stop": 2.0}, "stop"), ({"stop": float("inf")}, "leave it out"),
         ({"start": float("nan")}, "start is nan"), ({"events": 0}, "events"),

@@ -398,6 +398,7 @@ def test_the_same_name_twice_is_an_error(tmp_path, weights):
     "choice, message",
     [
         ({"chunk": 0}, "chunk"), ({"fps": -1.0}, "fps"), ({"stop": -1.0}, "stop"),
+        ({"stop": 1e14}, "stop is"), ({"start": -1e14}, "start is"),
         ({"stop": float("inf")}, "leave it out"), ({"start": float("nan")}, "start is nan"),
         ({"process": 1}, "both of --processes"), ({"process": 2, "processes": 2}, "from 0"),
         ({"sensor_size": "240"}, "WIDTHxHEIGHT"), ({"sensor_size": "0x5"}, "WIDTHxHEIGHT"),

@@ -263,6 +263,10 @@ def test_faults_are_switched_on_but_what_is_given_stays():
     sensor = random_sensor(jax.random.key(0), height=2, width=3, settings=chosen)
     assert sensor.noise is None and sensor.on.shape == () and sensor.drift is not None
     assert sensor.refractory == 5_000 * TICKS
+    # also where it is what stands there if nothing is said
+    sensor = random_sensor(jax.random.key(1), height=2, width=3,
+                           settings=with_faults(SensorSettings(refractory=1e-3)))  # fmt: skip
+    assert sensor.refractory == 1_000 * TICKS
 
 
 @pytest.mark.parametrize(
@@ -274,6 +278,7 @@ def test_faults_are_switched_on_but_what_is_given_stays():
         ({"threshold": -1.0}, "threshold is -1"), ({"refractory": -1.0}, "refractory is -1"),
         ({"mismatch": np.nan}, "mismatch"),
         ({"threshold": 0.3, "threshold_range": (0.1, 0.6)}, "pass --threshold-range None too"),
+        ({"threshold": 0.18, "threshold_range": (0.1, 0.6)}, "pass --threshold-range None too"),
         ({"refractory": 5e-3, "refractory_range": (1e-4, 1e-3)}, "pass --refractory-range None"),
     ],
 )  # fmt: skip

@@ -43,8 +43,14 @@ def test_a_folder_of_pictures_with_subfolders(tmp_path):
     (tmp_path / "notes.txt").write_text("no picture")
     textures = load_textures(tmp_path, count=5, size=64)
     assert textures.shape == (5, 64, 64)
-    # both pictures come before either comes again
-    assert load_textures(tmp_path, count=2, size=64, seed=9).shape == (2, 64, 64)
+
+
+def test_every_picture_comes_before_any_comes_again(tmp_path):
+    for grey in range(6):
+        Image.new("L", (100, 100), 40 * grey).save(tmp_path / f"{grey}.png")
+    for seed in range(3):
+        textures = load_textures(tmp_path, count=6, size=64, seed=seed)
+        assert len({float(texture.mean()) for texture in textures}) == 6
 
 
 def test_only_as_many_pictures_are_opened_as_are_asked_for(tmp_path, monkeypatch):
@@ -80,6 +86,12 @@ def test_sixteen_bits_are_as_bright_as_eight(tmp_path, suffix):
     np.testing.assert_array_equal(load_textures(tmp_path / "deep", 3, 64), expected)
 
 
+def test_ten_bits_in_sixteen_keep_their_greys(tmp_path):
+    ramp = np.linspace(0, 1023, 100 * 100).reshape(100, 100).astype(np.uint16)
+    Image.fromarray(ramp).save(tmp_path / "a.png")
+    assert len(np.unique(np.round(255 * load_textures(tmp_path, 1, 64)))) > 30
+
+
 def test_fractions_are_refused_by_name(tmp_path, caplog):
     picture(tmp_path / "good.png")
     Image.fromarray(np.random.default_rng(0).random((100, 100), np.float32)).save(
@@ -107,5 +119,5 @@ def test_pictures_to_judge_by_are_in_no_pool(tmp_path):
     Image.new("L", (100, 100), 255).save(tmp_path / "mine.png")
     assert load_textures(tmp_path, count=20, size=64).min() == 1
     (tmp_path / "mine.png").unlink()
-    with pytest.raises(ValueError, match="holds no pictures"):
+    with pytest.raises(ValueError, match="holds no pictures .* but .*, which is held out"):
         load_textures(tmp_path, count=1, size=64)

@@ -173,6 +173,12 @@ def test_other_settings_do_not_continue_a_run(tmp_path):
     train._check_settings(tmp_path, tiny(tmp_path, log_every=7, save_every=60.0, validate_every=4))
 
 
+def test_an_output_that_is_a_file(tmp_path):
+    (tmp_path / "taken").write_text("mine")
+    with pytest.raises(ValueError, match="taken is a file, but a run needs a folder"):
+        run(tiny(tmp_path / "taken"))
+
+
 def test_a_run_that_failed_before_its_first_step_blocks_no_folder(tmp_path):
     with pytest.raises(ValueError, match="no such folder"):
         run(tiny(tmp_path / "run", images=tmp_path / "typo"))
@@ -255,6 +261,7 @@ def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypa
         ({"log_every": 0}, "log_every"), ({"validate_every": 0}, "validate_every"),
         ({"crop": 10}, "smaller than 11"), ({"procedural": 3.0}, "procedural"),
         ({"motion": (0.0, 2.0)}, "motion is 0 2"), ({"motion": (2.0, 1.0)}, "the least first"),
+        ({"seed": -3}, "seed is -3"), ({"seed": 5_000_000_000}, "less than 2"),
     ],
 )  # fmt: skip
 def test_impossible_settings(tmp_path, choice, message):

@@ -141,6 +141,35 @@ def test_a_link_stays_and_what_it_points_to_is_written(tmp_path, suffix):
     assert {path.name for path in tmp_path.iterdir()} == {link.name, target.name}
 
 
+def test_a_video_is_not_a_link_to_a_folder(tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link.mp4").symlink_to(tmp_path / "folder")
+    with pytest.raises(OutputError, match="is a folder: choose another name for the video"):
+        write_video(tmp_path / "link.mp4", ramp(2))
+
+
+@pytest.mark.parametrize("name", [".", ".."])
+def test_the_folder_one_is_in_is_no_output(tmp_path, monkeypatch, name):
+    """It would be replaced, and who is in it would see nothing."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    with pytest.raises(OutputError, match="is the folder that you are in"):
+        write_video(name, ramp(2))
+
+
+def test_what_is_not_ours_beside_an_output_stays(tmp_path):
+    (tmp_path / "out.partial").mkdir()
+    for name in ("notes.txt", "frame_old.png"):
+        (tmp_path / "out.partial" / name).write_text("mine")
+        with pytest.raises(OutputError, match=f"out.partial holds {name}, which is not of an"):
+            write_video(tmp_path / "out", ramp(2))
+        assert (tmp_path / "out.partial" / name).read_text() == "mine"
+        (tmp_path / "out.partial" / name).unlink()
+    (tmp_path / "out.partial" / "frame_0000000009.png").write_text("of an earlier run")
+    write_video(tmp_path / "out", ramp(2))
+    assert len(list((tmp_path / "out").iterdir())) == 3
+
+
 def test_replacing_a_folder_minds_what_lies_beside_it(tmp_path):
     (tmp_path / "out.old").mkdir()
     (tmp_path / "out.old" / "mine.txt").write_text("")
@@ -156,6 +185,13 @@ def test_times_before_zero(tmp_path):
     writer.finish()
     stamps = (tmp_path / "out" / "timestamps.txt").read_text().split()
     assert stamps == ["-1.000001", "-0.000001", "0.000000", "1.500000"]
+
+
+@pytest.mark.parametrize("fps", [0.0, 1e-4, 1e300, float("inf"), float("nan")])
+def test_rates_that_cannot_be(tmp_path, fps):
+    with pytest.raises(OutputError, match="must be between 0.01 and 10000"):
+        write_video(tmp_path / "a.mp4", ramp(), fps=fps)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_gif_has_a_greatest_rate(tmp_path):
