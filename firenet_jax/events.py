@@ -21,6 +21,9 @@ LARGEST = 2**15  # pixels of a sensor's side: coordinates are int16
 class RecordingError(ValueError):
     """A recording cannot be used; the message is one sentence: file, place, found, what to do."""
 
+    before: "Events | None" = None
+    """Of the chunk in which the damage lies, the events before it, not checked."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Events:
@@ -104,7 +107,7 @@ def checked(
     from 0 over the whole recording) in the words of the file: "line 7".
     """
     rows, last = 0, None
-    for events in chunks:
+    for events in _with_rest(chunks):
         if len(events) == 0:
             continue
         t, x, y = events.t, events.x, events.y
@@ -141,6 +144,16 @@ def checked(
             f"{where}: {name} is {value}, outside the sensor of {width}x{height} pixels: pass the "
             "right --sensor-size WIDTHxHEIGHT"
         )
+
+
+def _with_rest(chunks: Iterable[Events]) -> Iterator[Events]:
+    """Also what came before the damage within a chunk."""
+    try:
+        yield from chunks
+    except RecordingError as error:
+        if error.before is not None:
+            yield error.before
+        raise
 
 
 def until_damage(chunks: Iterable[Events]) -> Iterator[Events]:

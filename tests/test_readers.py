@@ -208,7 +208,18 @@ def test_a_sensor_of_no_pixels_is_refused(tmp_path):
     refused(write(tmp_path / "a.txt", "0 0\n0.1 3 2 1\n"), "outside the sensor of 0x0", size=None)
 
 
-@pytest.mark.parametrize("bad", ["0.5 1 x 1", "0.5 1 2", "0.05 1 2 1", "0.5 1 999 1"])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        "0.5 1 x 1",
+        "0.5 1 2",
+        "0.05 1 2 1",
+        "0.5 1 999 1",
+        "0.5 40000 2 1",
+        "nan 1 2 1",
+        "0.5 1 2 7",
+    ],
+)
 def test_events_before_the_damage_are_read(tmp_path, bad):
     good = [f"{k / 10} 1 2 1" for k in range(5)]
     recording = open_recording(

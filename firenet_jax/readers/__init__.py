@@ -134,7 +134,8 @@ REACH = 2**15  # coordinates are int16
 def to_events(
     path: Path, row: int, t, x, y, p, place: Callable[[int], str] = event_number
 ) -> Events:
-    """Columns as a file holds them -> Events; refuses what those cannot hold, naming the row.
+    """Columns as a file holds them -> Events; refuses what those cannot hold, naming the row, in a
+    RecordingError that has the events before it.
 
     t: microseconds where integer, seconds where floating; p: bool, 0 and 1, or -1 and 1.
     row: the number of the first row in the recording, for `place`.
@@ -145,10 +146,12 @@ def to_events(
 
     def refuse(bad: np.ndarray, column: np.ndarray, name: str, expected: str):
         first = int(np.argmax(bad))
-        raise RecordingError(
+        error = RecordingError(
             f"{path}, {place(row + first)}: {name} is {column[first]}, {expected}: "
             "the file is damaged or of another format"
         )
+        error.before = to_events(path, row, t[:first], x[:first], y[:first], p[:first], place)
+        raise error
 
     for name, column in (("the time", t), ("x", x), ("y", y), ("the polarity", p)):
         if column.dtype.kind not in "biuf":
