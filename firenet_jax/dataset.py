@@ -34,7 +34,7 @@ import tyro
 from tqdm import tqdm
 
 from firenet_jax.events import Events, concatenate, parse_size
-from firenet_jax.files import OutputError, partial_name, write_text, writing
+from firenet_jax.files import OutputError, differences, partial_name, write_text, writing
 from firenet_jax.overlap import ahead
 from firenet_jax.scenes import (
     Scene,
@@ -389,16 +389,13 @@ def open_folder(settings: Simulate) -> None:
             found = json.loads(kept.read_text())
         except (OSError, ValueError) as error:
             raise OutputError(f"{kept} is damaged ({error}): choose another output") from error
-        other = sorted(name for name in {*found, *record} if found.get(name) != record.get(name))
+        other = differences(found, record)
         if other and not next(folder.glob("*/??????.h5"), None):
             kept.unlink()  # an earlier run wrote nothing else
         elif other:
-            pairs = ", ".join(
-                f"{name} was {found.get(name)!r}, now {record.get(name)!r}" for name in other
-            )
             raise OutputError(
-                f"{folder} holds sequences of other settings ({pairs}): choose another output, or "
-                "go on with the same settings"
+                f"{folder} holds sequences of other settings ({', '.join(other)}): choose another "
+                "output, or go on with the same settings"
             )
     elif folder.is_dir() and any(folder.iterdir()):
         raise OutputError(

@@ -73,3 +73,15 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     except Exception as error:  # damaged bytes reach every kind: Value, BadZip, EOF, tokenize's
         reason = " ".join(str(error).split())[:100]  # numpy's span lines
         raise OutputError(f"{path} is damaged ({reason}): remove it and run again") from error
+
+
+def differences(found: dict, now: dict, but: tuple[str, ...] = ()) -> list[str]:
+    """What is said of each setting of an earlier run that differs, those within others too."""
+    said = []
+    for name in sorted({*found, *now} - set(but)):
+        was, is_now = found.get(name), now.get(name)
+        if isinstance(was, dict) and isinstance(is_now, dict):
+            said += [f"{name}.{inner}" for inner in differences(was, is_now)]
+        elif was != is_now:
+            said.append(f"{name} was {was}, now {is_now}")
+    return said

@@ -56,7 +56,7 @@ from firenet_jax.devices import (
     shared,
 )
 from firenet_jax.events import logger
-from firenet_jax.files import write_text
+from firenet_jax.files import differences, write_text
 from firenet_jax.losses import Loss, sequence_loss
 from firenet_jax.network import State, Weights, initial_params, initial_state, step
 from firenet_jax.pictures import event_pictures
@@ -605,18 +605,6 @@ def _filled(found: dict, defaults: dict) -> dict:
     return defaults | found | inner
 
 
-def _differences(found: dict, now: dict) -> list[str]:
-    """What is said of each setting that differs, also within `loss`, `scene` and so on."""
-    said = []
-    for name in sorted({*found, *now} - set(FREE)):
-        was, is_now = found.get(name), now.get(name)
-        if isinstance(was, dict) and isinstance(is_now, dict):
-            said += [f"{name}.{inner}" for inner in _differences(was, is_now)]
-        elif was != is_now:
-            said.append(f"{name} was {was}, now {is_now}")
-    return said
-
-
 def _check_settings(folder: Path, settings: Train) -> None:
     """Raises ValueError if the folder holds a run of other settings.
 
@@ -633,7 +621,7 @@ def _check_settings(folder: Path, settings: Train) -> None:
         found = _filled(json.loads(path.read_text()), json.loads(_as_text(Train(folder))))
     except (ValueError, AttributeError) as error:
         raise ValueError(f"{path} is damaged ({error}): choose another --output") from error
-    if other := _differences(found, json.loads(_as_text(settings))):
+    if other := differences(found, json.loads(_as_text(settings)), but=FREE):
         raise ValueError(
             f"{folder} holds a run with other settings ({', '.join(other)}): choose another "
             "--output, or go on with the same settings"

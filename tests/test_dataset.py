@@ -368,7 +368,7 @@ def bad_lines(folder):
         ("-o a.h5", "go into a folder"),
         ("-o file/set", "cannot write there"),
         ("-o damaged", "is damaged"),
-        ("-o other", "seconds was 0.2, now 2.0"),
+        ("-o other", "scene.speed was [20.0, 100.0], now [3.0, 1000.0], seconds was 0.2, now 2.0"),
         ("-o out --video clip.mp4", "out.h5"),
         ("-o out.h5 --video clip.mp4", "cannot be read as a video"),
         ("-o out.h5 --video missing.mp4", "cannot be read as a video"),
