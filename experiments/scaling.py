@@ -131,10 +131,11 @@ from firenet_jax.pipeline import Reconstruct, run
 folder, output, *where = sys.argv[1:]
 processes, process = map(int, where) if where else [None] * 2
 recordings = tuple(sorted(Path(folder).glob("*.txt")))
-choices = dict(processes=processes, process=process, overwrite=True)
-run(Reconstruct(recordings, Path(output), **choices))
+choices = dict(processes=processes, process=process)
+run(Reconstruct(recordings, Path(output, "compiling"), **choices))
 start = time.perf_counter()
-run(Reconstruct(recordings, Path(output), **choices))
+# Elsewhere: of the same output, what this process has done is not done again.
+run(Reconstruct(recordings, Path(output, "measured"), **choices))
 print("seconds", time.perf_counter() - start)
 """
 
