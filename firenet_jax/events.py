@@ -15,7 +15,8 @@ import numpy as np
 
 logger = logging.getLogger("firenet_jax")
 
-LARGEST = 2**15  # pixels of a sensor's side: coordinates are int16
+LATEST = 2**53  # microseconds, 285 years: float64 seconds lose microseconds beyond
+REACH = 2**15  # pixels of a sensor's side at most: coordinates are int16
 
 
 class RecordingError(ValueError):
@@ -176,6 +177,6 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise ValueError(f"sensor size {text!r}: expected WIDTHxHEIGHT, such as 240x180")
-    if max(int(width), int(height)) > LARGEST:
-        raise ValueError(f"sensor size {text}: a side is at most {LARGEST} pixels")
+    if max(int(width), int(height)) > REACH:
+        raise ValueError(f"sensor size {text}: a side is at most {REACH} pixels")
     return int(height), int(width)

@@ -10,15 +10,13 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import median_filter
 
-from firenet_jax.events import Events, Recording, RecordingError, until_damage
-
-LONGEST = 2**53 / 1e6  # seconds, 285 years: as far as times in recordings reach
+from firenet_jax.events import LATEST, Events, Recording, RecordingError, until_damage
 
 
 def check_span(start: float | None, stop: float | None) -> None:
     """Raises ValueError unless these seconds, None for no bound, are a part of a recording."""
     for name, value in (("start", start), ("stop", stop)):
-        if value is not None and not abs(value) < LONGEST:
+        if value is not None and not abs(value) < LATEST / 1e6:
             raise ValueError(f"{name} is {value} s, but must be a time: leave it out for none")
     if stop is not None and stop <= (start or 0):
         raise ValueError(f"stop is {stop} s, but must come after the start")

@@ -27,9 +27,7 @@ OTHER_FILES = (
     ".txt", ".csv", ".json", ".raw", ".dat", ".bin", ".es", ".aedat", ".aedat4",
     ".bag", ".db3", ".mcap",
 )  # fmt: skip
-PICTURE = re.compile(r"frame_(\d{10,})\.png")
-# What is ours in a folder of pictures.
-OURS = re.compile(rf"timestamps\.txt|resume[.\w]*\.npz|{PICTURE.pattern}")
+OURS = re.compile(r"timestamps\.txt|resume[.\w]*\.npz|frame_\d{10,}\.png")  # in a folder
 RATES = 0.01, 10_000  # pictures per second
 GIF_RATE = 100  # pictures per second, the most that the format can say
 PNG_LEVEL = 4  # on grey pictures 25 % faster than the default 6, files 2 % larger
@@ -76,24 +74,17 @@ def check_output(path: Path, overwrite: bool) -> None:
     if path.is_dir() and Path.cwd().is_relative_to(path.resolve()):
         raise OutputError(f"{path} is the folder that you are in: choose a folder in it")
     begun = partial_name(path)
-    if path.suffix not in VIDEOS and begun.exists():
-        strange = (
-            []
-            if not begun.is_dir()
-            else [entry.name for entry in begun.iterdir() if not OURS.fullmatch(entry.name)]
+    if path.suffix not in VIDEOS and (strange := _strange(begun)):
+        raise OutputError(
+            f"{begun} holds {strange}, which is not of an earlier run: remove it or choose another "
+            "output"
         )
-        if strange or not begun.is_dir():
-            raise OutputError(
-                f"{begun}{f' holds {min(strange)}, which' if strange else ''} is not of an earlier "
-                "run: remove it or choose another output"
-            )
     if occupied and path.is_dir():
-        names = [entry.name for entry in path.iterdir()]
-        strange = [name for name in names if not OURS.fullmatch(name)]
-        if strange or "timestamps.txt" not in names:
+        stamped = (path / "timestamps.txt").is_file()
+        strange = _strange(path) or (None if stamped else min(path.iterdir()).name)
+        if strange:
             raise OutputError(
-                f"{path} holds {min(strange or names)}, which this program did not write: choose "
-                "another output"
+                f"{path} holds {strange}, which this program did not write: choose another output"
             )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -103,6 +94,12 @@ def check_output(path: Path, overwrite: bool) -> None:
         ) from error
     if not os.access(path.parent, os.W_OK):
         raise OutputError(f"{path.parent} is not writable: choose another output")
+
+
+def _strange(folder: Path) -> str | None:
+    """The first of the names in it that no folder of pictures has."""
+    names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
+    return min((name for name in names if not OURS.fullmatch(name)), default=None)
 
 
 class FolderWriter:
@@ -137,10 +134,9 @@ class FolderWriter:
     def finish(self) -> None:
         with writing(self.path):
             self.stamps.close()
-            for file in self.partial.iterdir():
-                picture = PICTURE.fullmatch(file.name)
-                if picture and int(picture[1]) >= self.count:  # of a longer run before this one
-                    file.unlink()
+            for extra in self.partial.glob("frame_*.png"):  # of a longer run before this one
+                if int(extra.stem.removeprefix("frame_")) >= self.count:
+                    extra.unlink()
             old = None
             if self.path.exists() and any(self.path.iterdir()):
                 old = Path(tempfile.mkdtemp(prefix=f"{self.path.name}.old.", dir=self.path.parent))
@@ -160,7 +156,6 @@ class VideoWriter:
 
     def __init__(self, path: Path, fps: float):
         self.path, self.partial = path, partial_name(path)
-        check_rate(path, fps)
         self.rate = Fraction(fps).limit_denominator(1000)
         self.count = 0
         with writing(path):
@@ -229,7 +224,11 @@ def _palette_filter(height: int, width: int, rate: Fraction) -> av.filter.Graph:
 
 
 def open_writer(path: Path, fps: float, done: int = 0) -> FolderWriter | VideoWriter:
-    """done: pictures of an interrupted run to keep; only a folder can have them."""
+    """done: pictures of an interrupted run to keep; only a folder can have them.
+
+    Raises OutputError for a rate that the output cannot show.
+    """
+    check_rate(path, fps)
     return VideoWriter(path, fps) if path.suffix in VIDEOS else FolderWriter(path, done)
 
 
@@ -239,7 +238,6 @@ def write_video(path: str | Path, pictures: Iterable[np.ndarray], fps: float = 3
     Raises OutputError for another suffix or a name that cannot be written.
     """
     path = followed(Path(path))
-    check_rate(path, fps)
     check_output(path, overwrite=True)
     writer = open_writer(path, fps)
     try:

@@ -21,6 +21,8 @@ from types import ModuleType
 import numpy as np
 
 from firenet_jax.events import (
+    LATEST,
+    REACH,
     Events,
     Frames,
     Recording,
@@ -125,10 +127,6 @@ def joined(chunks: Iterable[Events], least: int = CHUNK // 4) -> Iterator[Events
 def microseconds(seconds: np.ndarray) -> np.ndarray:
     """float64 seconds -> int64 microseconds, to the nearest one (exact up to 285 years)."""
     return np.rint(np.asarray(seconds, np.float64) * 1e6).astype(np.int64)
-
-
-LATEST = 2**53  # microseconds, 285 years: float64 seconds lose microseconds beyond
-REACH = 2**15  # coordinates are int16
 
 
 def to_events(

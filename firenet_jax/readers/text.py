@@ -27,8 +27,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 
-from firenet_jax.events import Events, RecordingError, logger
-from firenet_jax.readers import REACH, Source, reading, to_events
+from firenet_jax.events import REACH, Events, RecordingError, logger
+from firenet_jax.readers import Source, reading, to_events
 
 BLOCK = 1 << 21  # bytes parsed at once: about 90,000 events
 HEAD = 1 << 16  # bytes from which the layout is told
