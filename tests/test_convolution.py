@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from firenet_jax.convolution import convolve, in_pairs, kernel_gradient
+from firenet_jax.convolution import convolve, kernel_gradient, side_by_side
 
 
 def slow_convolution(image, kernel):
@@ -39,9 +39,11 @@ def test_equals_the_loops(shape):
 
 @pytest.mark.parametrize("width", [1, 2, 3, 8, 9])
 @pytest.mark.parametrize("shape", [(3, 3, 16, 16), (3, 5, 4, 2), (1, 7, 2, 3)])
-def test_in_pairs_it_is_the_same_at_every_width(shape, width):
+@pytest.mark.parametrize("pixels", [2, 4])
+def test_side_by_side_it_is_the_same_at_every_width(shape, width, pixels):
     image, kernel = random_case(shape, width=width)
-    np.testing.assert_allclose(in_pairs(image, kernel), slow_convolution(image, kernel), atol=1e-4)
+    result = side_by_side(image, kernel, pixels)
+    np.testing.assert_allclose(result, slow_convolution(image, kernel), atol=1e-4)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
