@@ -13,11 +13,14 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 
 from firenet_jax.convolution import convolve
 
 CHANNELS = 16
 BINS = 5
+
+CONVOLVED = "convolved"  # the name of what costs to compute again for a gradient
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["params"], meta_fields=["normalise"])
@@ -44,7 +47,7 @@ def initial_state(batch: int, height: int, width: int) -> State:
 
 def _quick(image, kernel, *_, **__):
     """Flax's hook for the convolution of a layer: ours, whose gradient is quick on a CPU."""
-    return convolve(image, kernel)
+    return checkpoint_name(convolve(image, kernel), CONVOLVED)
 
 
 def _conv(outputs: int, dtype) -> nn.Conv:
@@ -80,7 +83,7 @@ class ConvGRU(nn.Module):
             )
 
         def turned(state_and_input, kernel, *_, **__):
-            return convolve(state_and_input, jnp.roll(kernel, self.features, 2))
+            return _quick(state_and_input, jnp.roll(kernel, self.features, 2))
 
         self.gates = conv(2 * self.features)
         self.candidate = conv(self.features)
