@@ -85,7 +85,7 @@ def stages(recording: Path, folder: Path) -> dict:
 
     def reading() -> list:
         job = Job(open_recording(recording), folder / "none", "")
-        return list(in_chunks([job], settings, slots=1, devices=1))
+        return list(in_chunks([job], settings, slots=1, devices=1, failed={}))
 
     chunks = reading()
 

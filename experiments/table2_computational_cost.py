@@ -66,7 +66,7 @@ def traced_multiply_adds(jaxpr) -> int:
     """Those of all convolutions of a traced program; zeros put in between are not multiplied.
 
     Where platforms differ (`cond`), those of the last branch: what a CPU multiplies in vain to be
-    quicker (`convolution.in_pairs`) is no work of the network.
+    quicker (`convolution.side_by_side`) is no work of the network.
     """
     total = 0
     for equation in jaxpr.eqns:

@@ -17,6 +17,9 @@ float32 is float32 on a GPU too: TF32 is off on both sides.
     python experiments/xla_vs_pytorch.py --parts training               measures one part again
     python experiments/xla_vs_pytorch.py --quick                        5 minutes; saves nothing
 
+A step is held against what no such network can beat on the machine: its products at the rate of
+two large matrices' product ("its products alone").
+
 "first s" is the first call: compilation, if there is any, and one run. "peak MB" is by how much
 a fresh process grows while the method runs warm (on a GPU: what its framework holds at most).
 Writes results/xla_vs_pytorch.json and .png (xla_vs_pytorch_gpu on a GPU).
@@ -29,6 +32,7 @@ import gc
 import json
 import os
 import shutil
+import statistics
 import subprocess
 import sys
 import time
@@ -54,7 +58,13 @@ from pytorch_firenet import (
 
 from firenet_jax.events import Events
 from firenet_jax.losses import Loss
-from firenet_jax.network import Weights, initial_params, initial_state, step
+from firenet_jax.network import (
+    Weights,
+    initial_params,
+    initial_state,
+    multiply_adds,
+    step,
+)
 from firenet_jax.reconstruction import Network, events_to_pictures, initial_session, reconstruct
 from firenet_jax.scenes import SceneSettings
 from firenet_jax.sensor import SensorSettings
@@ -438,7 +448,36 @@ def measure_step(options) -> dict:
         cases += [(width, height, batch) for batch in BATCHES if batch <= 16 // less]
     cases = [cases[0]] if options.quick else cases
     units = {"JAX in scan": IN_SCAN, "JAX in scan, bfloat16": IN_SCAN}
-    return {"cases": [compare("step", case, units, options) for case in cases]}
+    rate = products_per_second(options.runs)
+    results = []
+    for width, height, batch in cases:
+        result = compare("step", (width, height, batch), units, options)
+        limit = 1e3 * batch * multiply_adds(height, width) / rate
+        print(f"{'its products alone, as in a matrix':34} {limit:10.2f}")
+        results.append(result | {"limit_ms": limit})
+    return {"cases": results, "products_per_second": rate}
+
+
+def products_per_second(runs: int) -> float:
+    """Multiply-adds in the product of two large float32 matrices, of the quicker framework.
+
+    What the device can do: no network of these convolutions takes less time than its products.
+    """
+    size = 4096
+    matrix = np.random.default_rng(0).normal(size=(size, size)).astype(np.float32)
+    ours, theirs = jax.device_put(matrix), torch.from_numpy(matrix).to(DEVICE)
+    product = jax.jit(jnp.matmul)
+
+    def torch_product():
+        theirs @ theirs
+        wait()
+
+    methods = {
+        "JAX": lambda: product(ours, ours).block_until_ready(),
+        "PyTorch": torch_product,
+    }
+    seconds = interleaved(methods, runs, REST)
+    return size**3 / min(statistics.median(each) for each in seconds.values())
 
 
 def measure_pipeline(options) -> dict:
@@ -509,6 +548,9 @@ def plot(results: dict, path: Path) -> None:
             places = np.arange(len(cases)) + 0.8 * ((k + 0.5) / len(names) - 0.5)
             axis.bar(places, middle, 0.8 / len(names), color=COLOURS[name], label=name)
             axis.errorbar(places, middle, spread, fmt="none", ecolor="0.3", lw=0.8)
+        if part == "step":
+            limits = [case["limit_ms"] for case in cases]
+            axis.hlines(limits, places - 0.8, places + 0.1, color="k", label="its products alone")
         labels = ["x".join(map(str, case["case"][:2])) for case in cases]
         labels = [f"{label} px" for label in labels]
         axis.set(yscale="log", title=titles[part], xticks=range(len(cases)), xticklabels=labels)
