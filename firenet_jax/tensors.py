@@ -33,7 +33,7 @@ CAPACITIES = tuple(2**14 * 8**k for k in range(6))
 
 BLOCK, BLOCKS = 2**17, 8  # events that vote at once on a CPU, and how many such steps in a row
 
-HELPER = ThreadPoolExecutor(1, "pack")
+HELPER = ThreadPoolExecutor(1, "pack")  # copies beside the thread that packs
 
 
 class Packed(NamedTuple):
