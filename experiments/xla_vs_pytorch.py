@@ -17,8 +17,8 @@ float32 is float32 on a GPU too: TF32 is off on both sides.
     python experiments/xla_vs_pytorch.py --parts training               measures one part again
     python experiments/xla_vs_pytorch.py --quick                        5 minutes; saves nothing
 
-A step is held against what no such network can beat on the machine: its products at the rate of
-two large matrices' product ("its products alone").
+A step is held against what direct convolutions cannot beat: their products at the rate of two large
+matrices' product ("its products alone").
 
 "first s" is the first call: compilation, if there is any, and one run. "peak MB" is by how much
 a fresh process grows while the method runs warm (on a GPU: what its framework holds at most).
@@ -461,7 +461,7 @@ def measure_step(options) -> dict:
 def products_per_second(runs: int) -> float:
     """Multiply-adds in the product of two large float32 matrices, of the quicker framework.
 
-    What the device can do: no network of these convolutions takes less time than its products.
+    What the device can do: direct convolutions do not take less time than their products.
     """
     size = 4096
     matrix = np.random.default_rng(0).normal(size=(size, size)).astype(np.float32)

@@ -139,7 +139,7 @@ class Train:
     bfloat16: bool = False
     """Convolutions in bfloat16."""
     remat: bool = False
-    """Compute convolutions again for the gradient: half of the memory, a little more time."""
+    """Compute convolutions again for the gradient: less memory, a little more time."""
     log_every: int = 20
     """Steps between two lines of the log."""
     validate_every: int = 500
