@@ -176,11 +176,12 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
     def vote(planes, columns):
         t, x, y, p, window = columns
         # Indices of unused places reach past the end of t_min; they are clamped and dropped later.
-        window, x, y = (column.astype(jnp.int32) for column in (window, x, y))
+        # As unsigned numbers, what is negative lies past every end too.
+        window, x, y = (column.astype(jnp.uint32) for column in (window, x, y))
         since = t - packed.t_min.ravel()[window]  # int32: exact, modulo 2^32
         t_star = (BINS - 1) * since.astype(jnp.float32) / packed.duration.ravel()[window]
-        seen = (0 <= x) & (x < width) & (0 <= y) & (y < height) & (window < windows)
-        pixel = (window * height + y) * width + x
+        seen = (x < width) & (y < height) & (window < windows)
+        pixel = jnp.where(seen, (window * height + y) * width + x, jnp.uint32(2**31))
 
         # The triangle is not zero in two bins only, those around t*, of which one is even and one
         # odd: two sums that share nothing, so that a CPU runs them side by side. One plane a bin,
@@ -189,9 +190,8 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
         for first, (bins, planes_of) in enumerate(zip((even, odd), planes, strict=True)):
             k = jnp.floor((t_star + 1 - first) / 2)  # of bins first, first + 2, ... the one near t*
             votes = jnp.where(p, 1.0, -1.0) * (1 - jnp.abs(2 * k + first - t_star))
-            place = k.astype(jnp.int32) * (windows * plane) + pixel
-            # A place past the end is dropped; a negative one would wrap round.
-            place = jnp.where(seen & (0 <= k) & (k < bins), place, planes_of.size)
+            k = jnp.clip(k, -1, bins).astype(jnp.int32).astype(jnp.uint32)
+            place = k * (windows * plane) + pixel  # what is past the end is dropped
             sums.append(planes_of.at[place].add(votes, mode="drop"))
         return tuple(sums), None
 
