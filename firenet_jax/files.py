@@ -38,13 +38,14 @@ def identity(path: Path) -> list:
 
 @contextlib.contextmanager
 def writing(path: Path):
-    """Full disks and the like, said with the name of the output."""
+    """Full disks and the like, said with the name of the output and of what is in the way."""
     try:
         yield
     except OSError as error:
+        where = "" if error.filename in (None, path, str(path)) else f", {error.filename}"
         raise OutputError(
-            f"{path}: cannot write ({error.strerror or error}): nothing is under this name yet; "
-            "make room or choose another output"
+            f"{path}: cannot write ({error.strerror or error}{where}): nothing is under this "
+            "name yet; make room or choose another output"
         ) from error
 
 

@@ -37,6 +37,12 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
             write(tmp_path / "gone" / "a.npz")
 
 
+def test_what_is_in_the_way_is_named(tmp_path):
+    (tmp_path / "a.partial.txt").mkdir()
+    with pytest.raises(OutputError, match=r"a.txt: cannot write \(.*, .*a.partial.txt\)"):
+        write_text(tmp_path / "a.txt", "new")
+
+
 def test_damaged_arrays_are_named_whatever_is_wrong_with_them(tmp_path):
     path, rng = tmp_path / "a.npz", np.random.default_rng(0)
     np.savez(path, x=np.arange(100))

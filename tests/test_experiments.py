@@ -1,0 +1,71 @@
+"""Every script of `experiments/` runs to its end, on next to nothing; its figures mean nothing."""
+
+import importlib.util
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import firenet_jax as fj
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+WEIGHTS = Path(fj.__file__).parent / "weights" / "firenet.npz"
+
+# Arguments that leave next to nothing to do. {recording} is a small one, {folder} where it lies.
+SMALL = {
+    "bfloat16": f"{WEIGHTS} {{recording}} --windows 12",
+    "figure3_qualitative": "--seconds 0.2",
+    "figure4_high_speed": "--seconds 0.1 --windows 4",
+    "figure5_recurrence": "--seconds 0.2",
+    "figure6_limitations": "--seconds 0.2 --sequences 1",
+    "file_to_pictures": "--events 60000 --runs 1",
+    "memory": "--hdf5 200000 --text 200000 --runs 1",
+    "readme_picture": f"{WEIGHTS} {{recording}}",
+    "scaling": "--quick",
+    "shipped_weights": f"{WEIGHTS} {{recording}} --skip-simulated",
+    "simulator_speed": "--runs 1 --lists 1",
+    "simulator_statistics": "{folder} --sequences 1",
+    "table1_model_size": "",
+    "table2_computational_cost": "--quick",
+    "table3_accuracy": "--seconds 0.4",
+    "train_default": "none --report-only",
+    "voxelisation": "--events 10000 --runs 1 --repeats 1",
+    "xla_vs_pytorch": "--quick --parts pipeline",
+}
+TRAIN = {"compare_losses", "compare_optimisers"}  # minutes, even for a step each
+SHARED = {"figures", "harness", "pytorch_firenet"}  # no scripts: what several import
+
+
+def test_no_script_is_forgotten():
+    assert {path.stem for path in EXPERIMENTS.glob("*.py")} == SMALL.keys() | TRAIN | SHARED
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SMALL)
+def test_runs(name, tmp_path):
+    script = (EXPERIMENTS / f"{name}.py").read_text()
+    for library in re.findall(r"^import (torch|pandas)$", script, re.MULTILINE):
+        if importlib.util.find_spec(library) is None:
+            pytest.skip(f"needs {library}")
+    # A copy, because scripts write beside themselves.
+    shutil.copytree(EXPERIMENTS, tmp_path / "experiments")
+    (tmp_path / "docs").mkdir()
+    recording = tmp_path / "recordings" / "random.txt"
+    recording.parent.mkdir()
+    rng = np.random.default_rng(0)
+    times, places = np.sort(rng.uniform(0, 0.5, 20_000)), rng.integers(0, (64, 48, 2), (20_000, 3))
+    rows = zip(times, places, strict=True)
+    lines = "".join(f"{t:.6f} {x} {y} {p}\n" for t, (x, y, p) in rows)
+    recording.write_text(f"64 48\n{lines}")
+    arguments = SMALL[name].format(recording=recording, folder=recording.parent).split()
+    done = subprocess.run(
+        [sys.executable, f"experiments/{name}.py", *arguments],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
