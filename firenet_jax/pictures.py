@@ -2,7 +2,8 @@
 
 Images are (T, B, H, W) float32 as the network gives them; pictures are (T, B, H, W) uint8, event
 pictures (T, B, H, W, 3) uint8. Sharpened by an unsharp mask, stretched from an intensity range to
-0..255, clipped and rounded. (The original truncates to 8 bits, which darkens by half a level.)
+0..255, clipped, if asked for smoothed, and rounded. (The original truncates to 8 bits, which
+darkens by half a level.)
 """
 
 from dataclasses import dataclass
@@ -25,6 +26,14 @@ class Display:
     """Strength of the unsharp mask; 0 switches it off."""
     auto_range: bool = False
     """Stretch the contrast to the range of the last 11 images instead of the fixed 0 to 1."""
+    bilateral: float = 0.0
+    """Smooth noise but not edges: sigma of a bilateral filter in grey levels, such as 25; 0
+    switches it off."""
+
+    def __post_init__(self):
+        for name in ("unsharp", "bilateral"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, but must be 0 or more")
 
 
 class DisplayState(NamedTuple):
@@ -82,7 +91,7 @@ def display(
     if settings.unsharp:
         images = unsharp_mask(images, settings.unsharp)
     if not settings.auto_range:
-        return state, _to_8_bit(images)
+        return state, _to_8_bit(images, settings.bilateral)
     if valid is None:
         valid = jnp.ones(images.shape[:2], bool)
     lows = jnp.clip(images.min((-2, -1)), 0, 0.45)
@@ -99,11 +108,35 @@ def display(
 
     state, (low, high) = jax.lax.scan(remember, state, (lows, highs, valid))
     low, high = low[..., None, None], high[..., None, None]
-    return state, _to_8_bit((images - low) / (high - low))
+    return state, _to_8_bit((images - low) / (high - low), settings.bilateral)
 
 
-def _to_8_bit(images: jax.Array) -> jax.Array:
-    return jnp.round(jnp.clip(255 * images, 0, 255)).astype(jnp.uint8)
+def _to_8_bit(images: jax.Array, sigma: float) -> jax.Array:
+    levels = jnp.clip(255 * images, 0, 255)
+    levels = 255 * bilateral(levels / 255, sigma) if sigma else levels
+    return jnp.round(levels).astype(jnp.uint8)
+
+
+@partial(jax.jit, static_argnames="sigma")
+def bilateral(images: jax.Array, sigma: float = 25.0) -> jax.Array:
+    """(..., H, W) in [0, 1] -> means of 5x5 pixels without the corners, of those that are alike.
+
+    Weights exp(-d^2 / (2 sigma^2)) for the distance d in pixels and for the difference in grey
+    levels of 255, at the 13 places with d <= 2; mirrored beyond the border (without repeating
+    it). As cv2.bilateralFilter(image, 5, sigma, sigma), but not rounded to 8 bits.
+    """
+    height, width = images.shape[-2:]
+    padded = jnp.pad(images, [(0, 0)] * (images.ndim - 2) + [(2, 2)] * 2, mode="reflect")
+    total, weights = 0.0, 0.0
+    for i in range(-2, 3):
+        for j in range(-2, 3):
+            if i**2 + j**2 <= 4:
+                neighbour = padded[..., 2 + i : 2 + i + height, 2 + j : 2 + j + width]
+                square = i**2 + j**2 + (255 * (neighbour - images)) ** 2
+                weight = jnp.exp(square / (-2 * sigma**2))
+                total += weight * neighbour
+                weights += weight
+    return total / weights
 
 
 def event_pictures(tensors: jax.Array) -> jax.Array:

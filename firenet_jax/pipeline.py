@@ -119,8 +119,6 @@ class Reconstruct:
                 raise ValueError(f"{name} is {value}, but must be more than 0")
         if self.network.pad < 1:
             raise ValueError(f"pad is {self.network.pad}, but pads to a multiple of 1 or more")
-        if self.display.unsharp < 0:
-            raise ValueError(f"unsharp is {self.display.unsharp}, but must be 0 or more")
         if not self.recordings:
             raise ValueError("no recording: name one or more files or folders")
         filters.check_span(self.start, self.stop)

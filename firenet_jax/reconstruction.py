@@ -5,7 +5,7 @@ may be streamed in chunks of any T, and B recordings of different lengths may ru
 `valid` (T, B) says which windows exist, and the others leave the state as it was.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
+from firenet_jax import colour
 from firenet_jax.devices import BATCH, EVERYWHERE, TIME_BATCH, on_each_device
 from firenet_jax.network import BINS, State, Weights, initial_state, step
 from firenet_jax.pictures import (
@@ -35,6 +36,9 @@ class Network:
     """Convolutions in bfloat16: faster on accelerators, slower on CPUs, a little less accurate."""
     pad: int = 1
     """Pad tensors by reflection to a multiple of this; 16 is what the original program does."""
+    color: bool = False
+    """Colours, of a sensor with a mosaic (rows of red and green, and of white or green and blue):
+    each is reconstructed by itself. Takes nearly twice as long."""
 
 
 @partial(jax.jit, static_argnames=("recurrent", "dtype"))
@@ -84,12 +88,30 @@ class Session(NamedTuple):
 
     network: State
     display: DisplayState
+    channels: "Session | None" = None
+    """The same of red, green and blue, leading axes (B, 3); None without colours."""
 
 
 def initial_session(batch: int, height: int, width: int, network: Network) -> Session:
+    """Raises ValueError for colours of a sensor with an odd side."""
     (top, bottom), (left, right) = padding(height, width, network.pad)
     state = initial_state(batch, top + height + bottom, left + width + right)
-    return Session(state, initial_display_state(batch))
+    channels = None
+    if network.color:
+        colour.check_sides(height, width)
+        grey = replace(network, color=False)
+        channels = _unfold(initial_session(3 * batch, height // 2, width // 2, grey))
+    return Session(state, initial_display_state(batch), channels)
+
+
+def _fold(channels):
+    """Arrays (B, 3, ...) -> (3 B, ...): three channels are three recordings side by side."""
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), channels)
+
+
+def _unfold(channels):
+    """Arrays (3 B, ...) -> (B, 3, ...)."""
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, 3, *leaf.shape[1:]), channels)
 
 
 def padding(height: int, width: int, multiple: int) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -118,15 +140,15 @@ def events_to_pictures(
     """(Session, the events of T x B windows) -> (Session, pictures), as one compiled program.
 
     Voxels, normalisation, padding, network, unsharp mask, intensity range, 8 bits. Pictures are
-    (T, B, H, W) uint8; with preview (T, B, H, 2 W, 3): the events beside the reconstruction.
+    (T, B, H, W) uint8, with colours (T, B, H, W, 3); with preview (T, B, H, 2 W, 3): the events
+    beside the reconstruction.
     valid: (T, B) bool, as in `reconstruct`.
     mesh: devices that share the B recordings equally, for events from `pack_for_devices`.
     """
 
-    def one_device(weights, session, events, valid):
-        tensors = voxelise(events, height=height, width=width)
+    def shown(weights, session, inputs, valid):
+        height, width = inputs.shape[2:4]
         (top, bottom), (left, right) = sides = padding(height, width, network.pad)
-        inputs = normalise(tensors) if weights.normalise else tensors
         inputs = jnp.pad(inputs, ((0, 0), (0, 0), *sides, (0, 0)), mode="reflect")
         state, images = reconstruct(
             Weights(weights.params, normalise=False),
@@ -137,12 +159,28 @@ def events_to_pictures(
             dtype=jnp.bfloat16 if network.bfloat16 else jnp.float32,
         )
         # The original program crops last: its mask and its range see the padded image.
-        shown, greys = display(session.display, images, valid, settings)
+        ranges, greys = display(session.display, images, valid, settings)
         greys = greys[:, :, top : top + height, left : left + width]
+        return Session(state, ranges), greys
+
+    def one_device(weights, session, events, valid):
+        tensors = voxelise(events, height=height, width=width)
+        inputs = normalise(tensors) if weights.normalise else tensors
+        after, pictures = shown(weights, session, inputs, valid)
+        if network.color:
+            planes = colour.channels(inputs)  # (T, B, 3, H/2, W/2, 5)
+            planes = planes.reshape(len(planes), -1, *planes.shape[3:])
+            channels, shades = shown(
+                weights, _fold(session.channels), planes, jnp.repeat(valid, 3, 1)
+            )
+            shades = shades.reshape(len(planes), -1, 3, *shades.shape[2:])
+            pictures = colour.coloured(pictures, shades)
+            after = after._replace(channels=_unfold(channels))
         if preview:
-            colours = jnp.broadcast_to(greys[..., None], (*greys.shape, 3))
-            greys = jnp.concatenate([event_pictures(tensors), colours], axis=-2)
-        return Session(state, shown), greys
+            if not network.color:
+                pictures = jnp.broadcast_to(pictures[..., None], (*pictures.shape, 3))
+            pictures = jnp.concatenate([event_pictures(tensors), pictures], axis=-2)
+        return after, pictures
 
     if mesh is not None:
         specs = EVERYWHERE, BATCH, IN_LISTS, TIME_BATCH

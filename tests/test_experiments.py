@@ -18,6 +18,7 @@ WEIGHTS = Path(fj.__file__).parent / "weights" / "firenet.npz"
 # Arguments that leave next to nothing to do. {recording} is a small one, {folder} where it lies.
 SMALL = {
     "bfloat16": f"{WEIGHTS} {{recording}} --windows 12",
+    "colour_mosaic": "--windows 4",
     "figure3_qualitative": "--seconds 0.2",
     "figure4_high_speed": "--seconds 0.1 --windows 4",
     "figure5_recurrence": "--seconds 0.2",

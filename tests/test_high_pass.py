@@ -4,8 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from firenet_jax.baselines.high_pass import HighPass, advance, bilateral, initial_state, pack, step
+from firenet_jax.baselines.high_pass import HighPass, advance, initial_state, pack, step
 from firenet_jax.events import Events
+from firenet_jax.pictures import bilateral
 from firenet_jax.windows import Window
 
 HEIGHT, WIDTH = 9, 11

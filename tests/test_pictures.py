@@ -1,9 +1,11 @@
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import references
 
 from firenet_jax.pictures import (
     Display,
+    bilateral,
     display,
     event_pictures,
     initial_display_state,
@@ -52,6 +54,27 @@ def test_automatic_range_survives_chunks_and_ignores_what_is_not_valid():
         parts.append(shown[: len(part)])
     np.testing.assert_array_equal(np.concatenate(parts), expected)
     np.testing.assert_array_equal(state.high, whole.high)
+
+
+def test_smoothed_pictures_keep_their_edges():
+    rng = np.random.default_rng(3)
+    images = jnp.where(jnp.arange(12) < 6, 0.2, 0.8) + jnp.asarray(
+        rng.normal(0, 0.02, (2, 1, 9, 12))
+    )
+    _, pictures = display(
+        initial_display_state(1), images, settings=Display(unsharp=0, bilateral=25.0)
+    )
+    np.testing.assert_array_equal(pictures, np.round(255 * bilateral(jnp.clip(images, 0, 1))))
+    noise = np.asarray(pictures)[..., 2:4].std(), 255 * np.asarray(images)[..., 2:4].std()
+    assert noise[0] < 0.6 * noise[1]
+    assert np.abs(np.asarray(pictures, int)[..., 6] - 0.8 * 255).max() < 15
+
+
+@pytest.mark.parametrize("name", ["unsharp", "bilateral"])
+@pytest.mark.parametrize("value", [-1.0, float("nan")])
+def test_impossible_settings(name, value):
+    with pytest.raises(ValueError, match=f"{name} is"):
+        Display(**{name: value})
 
 
 def test_event_pictures_show_the_sign_of_the_votes():

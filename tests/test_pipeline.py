@@ -17,6 +17,7 @@ from firenet_jax.files import OutputError, read_arrays
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pictures import Display
 from firenet_jax.pipeline import Reconstruct, run
+from firenet_jax.reconstruction import Network
 from firenet_jax.video import FolderWriter
 from firenet_jax.windows import Windows
 
@@ -142,10 +143,10 @@ def unfinished(weights, recording, output, monkeypatch):
             run(settings(weights, (recording,), output))
 
 
-@pytest.mark.parametrize("at", [2, 9, 30])
-def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, weights, monkeypatch, at):
+@pytest.mark.parametrize("at, color", [(2, False), (9, True), (30, False)])
+def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, weights, monkeypatch, at, color):
     recording = write_recording(tmp_path / "a.txt", 3050)
-    choices = {"display": Display(auto_range=True)}
+    choices = {"display": Display(auto_range=True), "network": Network(color=color)}
     run(settings(weights, (recording,), tmp_path / "whole", **choices))
     with monkeypatch.context() as patch:
         patch.setattr(pipeline, "RESUME_EVERY", 0)

@@ -15,6 +15,7 @@ PACKAGE = Path(fj.__file__).parent
 LAYERS = [
     [
         "events",
+        "colour",
         "convolution",
         "pictures",
         "files",

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.baselines.packing import clock, columns, seconds_between
+from firenet_jax.pictures import bilateral
 from firenet_jax.windows import Window
 
 FIXED_RANGE = (-0.5, 1.5)  # intensities shown black and white without `adaptive_range`
@@ -163,25 +164,3 @@ def _ranked(values: jax.Array, rank: int) -> jax.Array:
 
     found = jax.lax.fori_loop(0, 31, refine, jnp.int32(0))
     return jax.lax.bitcast_convert_type(found, jnp.float32)
-
-
-@partial(jax.jit, static_argnames="sigma")
-def bilateral(image: jax.Array, sigma: float = 25.0) -> jax.Array:
-    """(H, W) in [0, 1] -> means of 5x5 pixels without the corners, of those that are alike.
-
-    Weights exp(-d^2 / (2 sigma^2)) for the distance d in pixels and for the difference in grey
-    levels of 255, at the 13 places with d <= 2; mirrored beyond the border (without repeating
-    it). As cv2.bilateralFilter(image, 5, sigma, sigma), but not rounded to 8 bits.
-    """
-    height, width = image.shape
-    padded = jnp.pad(image, 2, mode="reflect")
-    total, weights = 0.0, 0.0
-    for i in range(-2, 3):
-        for j in range(-2, 3):
-            if i**2 + j**2 <= 4:
-                neighbour = padded[2 + i : 2 + i + height, 2 + j : 2 + j + width]
-                square = i**2 + j**2 + (255 * (neighbour - image)) ** 2
-                weight = jnp.exp(square / (-2 * sigma**2))
-                total += weight * neighbour
-                weights += weight
-    return total / weights
