@@ -286,6 +286,24 @@ def test_damaged_compressed_text(tmp_path):
     refused(tmp_path / "other.zip", "holds 0 text files where one is expected")
 
 
+@pytest.mark.parametrize("rows", [5000, 300_000])  # one block of text, and several
+@pytest.mark.parametrize("damage", ["cut", "changed"])
+def test_what_comes_before_damaged_compression_is_read(tmp_path, rows, damage):
+    content = "320 240\n" + "".join(f"{i / 1e6:.6f} {i % 320} 7 1\n" for i in range(rows))
+    packed = gzip.compress(content.encode())
+    half = len(packed) // 2
+    packed = packed[:half] + b"\xff" * 64 * (damage == "changed") + packed[half + 64 :]
+    path = write(tmp_path / "a.txt.gz", packed[:half] if damage == "cut" else packed)
+    times = []
+    # Changed bytes may still be unpacked, to other text.
+    said = "a.txt.gz: cannot be read" if damage == "cut" else "a.txt.gz"
+    with pytest.raises(RecordingError, match=said):
+        for events in open_recording(path).events():
+            times += events.t.tolist()
+    assert times == list(range(len(times)))
+    assert len(times) > 0.4 * rows
+
+
 @pytest.mark.parametrize(
     "content, said",
     [

@@ -122,7 +122,7 @@ def _only_text(path: Path) -> str:
 
 def _sniff(path: Path, member: str | None) -> Layout:
     with opened(path, member) as stream:
-        head = stream.read(HEAD)
+        head = next(_pieces(stream, HEAD), b"")
     lines = head.decode("utf-8-sig", "replace").split("\n")
     if len(head) == HEAD:
         lines.pop()  # cut off
@@ -197,11 +197,29 @@ def _words(line: str, separator: str) -> list[str]:
     return [word.strip() for word in line.split(",")] if separator == "," else line.split()
 
 
+def _pieces(stream: BinaryIO, size: int) -> Iterator[bytes]:
+    """So many bytes at a time; what comes before damage comes before its error."""
+    error, found = None, b"."
+    while found:
+        pieces, missing = [], size
+        while missing and found:
+            try:
+                found = stream.read1(missing)
+            except BROKEN as damage:  # kept: asked again, a zip would say that it has ended
+                error, found = damage, b""
+            pieces.append(found)
+            missing -= len(found)
+        if missing < size:
+            yield b"".join(pieces)
+    if error is not None:
+        raise error
+
+
 def _blocks(path: Path, member: str | None, skip: int) -> Iterator[tuple[int, bytes]]:
     """(number of its first line, whole lines), without the header."""
     number, rest = 1, b""
     with opened(path, member) as stream:
-        while data := stream.read(BLOCK):
+        for data in _pieces(stream, BLOCK):
             end = data.rfind(b"\n") + 1
             if not end and len(rest) > HEAD:
                 raise RecordingError(
