@@ -5,7 +5,7 @@ green; green, blue), and the events become pictures by `firenet reconstruct --co
 last picture: how a* and b* of CIELAB, the colours, correlate with those of the photograph, and the
 mean chroma of both. Colours of large smooth areas cannot come back: events tell edges.
 
-    python experiments/colour_mosaic.py [--windows 40]          two minutes
+    python experiments/colour_mosaic.py [--windows 40]          a minute
 
 Writes results/colour_mosaic.json and docs/colour_mosaic.jpg (photograph, grey, colour).
 """
@@ -21,7 +21,7 @@ from scipy.ndimage import shift
 from skimage import data
 
 from firenet_jax.checkpoint import load_weights
-from firenet_jax.colour import to_lab
+from firenet_jax.colour import CORNERS, to_lab
 from firenet_jax.events import concatenate
 from firenet_jax.reconstruction import Network, events_to_pictures, initial_session
 from firenet_jax.sensor import event_list, random_sensor
@@ -50,7 +50,8 @@ def views(photograph: np.ndarray, count: int):
 def mosaic(view: np.ndarray) -> np.ndarray:
     """(H, W, 3) -> (H, W): what each pixel sees through its filter."""
     seen = view[..., 1].copy()
-    seen[0::2, 0::2], seen[1::2, 1::2] = view[0::2, 0::2, 0], view[1::2, 1::2, 2]
+    for channel, (row, column) in enumerate(CORNERS):
+        seen[row::2, column::2] = view[row::2, column::2, channel]
     return seen
 
 

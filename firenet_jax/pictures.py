@@ -112,9 +112,9 @@ def display(
 
 
 def _to_8_bit(images: jax.Array, sigma: float) -> jax.Array:
-    levels = jnp.clip(255 * images, 0, 255)
-    levels = 255 * bilateral(levels / 255, sigma) if sigma else levels
-    return jnp.round(levels).astype(jnp.uint8)
+    images = jnp.clip(images, 0, 1)
+    images = bilateral(images, sigma) if sigma else images
+    return jnp.round(255 * images).astype(jnp.uint8)
 
 
 @partial(jax.jit, static_argnames="sigma")

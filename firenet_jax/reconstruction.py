@@ -38,7 +38,7 @@ class Network:
     """Pad tensors by reflection to a multiple of this; 16 is what the original program does."""
     color: bool = False
     """Colours, of a sensor with a mosaic (rows of red and green, and of white or green and blue):
-    each is reconstructed by itself. Takes nearly twice as long."""
+    each is reconstructed by itself, three quarters more work."""
 
 
 @partial(jax.jit, static_argnames=("recurrent", "dtype"))

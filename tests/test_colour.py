@@ -5,26 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from skimage.color import lab2rgb, rgb2lab
+from test_tensors import random_events
 
 from firenet_jax import colour
 from firenet_jax.checkpoint import load_weights
-from firenet_jax.events import Events, concatenate
-from firenet_jax.network import initial_state
+from firenet_jax.events import concatenate
+from firenet_jax.network import Weights, initial_state
 from firenet_jax.pictures import Display, display, initial_display_state
 from firenet_jax.reconstruction import Network, events_to_pictures, initial_session, reconstruct
 from firenet_jax.sensor import event_list, random_sensor
 from firenet_jax.tensors import normalise, pack, voxelise
 
 HEIGHT, WIDTH = 16, 20
-
-
-def random_events(rng, count, height=HEIGHT, width=WIDTH):
-    return Events.of(
-        np.sort(rng.integers(0, 50_000, count)),
-        rng.integers(0, width, count),
-        rng.integers(0, height, count),
-        rng.random(count) < 0.5,
-    )
 
 
 def test_lab_equals_scikit_image():
@@ -73,7 +65,10 @@ def test_without_colour_the_picture_is_the_grey_one():
 def test_each_channel_is_reconstructed_as_a_recording_of_its_own(auto_range):
     """Two recordings, in chunks of two windows; expected is one channel after another, at once."""
     rng, weights = np.random.default_rng(3), load_weights()
-    windows = [[random_events(rng, n + 30 * b) for b in range(2)] for n in (90, 200, 150, 120)]
+    windows = [
+        [random_events(rng, n + 30 * b, HEIGHT, WIDTH) for b in range(2)]
+        for n in (90, 200, 150, 120)
+    ]
     size = {"height": HEIGHT, "width": WIDTH}
     settings = Display(auto_range=auto_range)
     session, found = initial_session(2, HEIGHT, WIDTH, Network(color=True)), []
@@ -86,7 +81,7 @@ def test_each_channel_is_reconstructed_as_a_recording_of_its_own(auto_range):
 
     tensors = normalise(voxelise(pack(windows), **size))
     seen = []
-    raw = weights.__class__(weights.params, normalise=False)
+    raw = Weights(weights.params, normalise=False)
     for part in (tensors, *(tensors[..., r::2, c::2, :] for r, c in colour.CORNERS)):
         images = reconstruct(raw, initial_state(2, *part.shape[2:4]), part)[1]
         seen.append(display(initial_display_state(2), images, settings=settings)[1])
@@ -100,7 +95,7 @@ def test_each_channel_is_reconstructed_as_a_recording_of_its_own(auto_range):
 def test_preview_of_colours():
     weights, size = load_weights(), {"height": HEIGHT, "width": WIDTH}
     session = initial_session(1, HEIGHT, WIDTH, Network(color=True))
-    packed = pack([[random_events(np.random.default_rng(4), 100)]])
+    packed = pack([[random_events(np.random.default_rng(4), 100, HEIGHT, WIDTH)]])
     args = weights, session, packed, np.ones((1, 1), bool)
     plain = events_to_pictures(*args, **size, network=Network(color=True))[1]
     both = events_to_pictures(*args, **size, network=Network(color=True), preview=True)[1]

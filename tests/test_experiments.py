@@ -7,8 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
+from test_pipeline import write_recording
 
 import firenet_jax as fj
 
@@ -57,11 +57,7 @@ def test_runs(name, tmp_path):
     (tmp_path / "docs").mkdir()
     recording = tmp_path / "recordings" / "random.txt"
     recording.parent.mkdir()
-    rng = np.random.default_rng(0)
-    times, places = np.sort(rng.uniform(0, 0.5, 20_000)), rng.integers(0, (64, 48, 2), (20_000, 3))
-    rows = zip(times, places, strict=True)
-    lines = "".join(f"{t:.6f} {x} {y} {p}\n" for t, (x, y, p) in rows)
-    recording.write_text(f"64 48\n{lines}")
+    write_recording(recording, 20_000, width=64, height=48)
     arguments = SMALL[name].format(recording=recording, folder=recording.parent).split()
     done = subprocess.run(
         [sys.executable, f"experiments/{name}.py", *arguments],

@@ -143,7 +143,7 @@ def unfinished(weights, recording, output, monkeypatch):
             run(settings(weights, (recording,), output))
 
 
-@pytest.mark.parametrize("at, color", [(2, False), (9, True), (30, False)])
+@pytest.mark.parametrize("at, color", [(2, False), (9, False), (9, True), (30, False)])
 def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, weights, monkeypatch, at, color):
     recording = write_recording(tmp_path / "a.txt", 3050)
     choices = {"display": Display(auto_range=True), "network": Network(color=color)}
