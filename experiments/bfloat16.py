@@ -1,7 +1,7 @@
 """Float32 against bfloat16 convolutions -> how far the pictures differ.
 
 Question: what does --bfloat16 cost in accuracy? A recording is reconstructed twice from the same
-tensors; state and blending stay float32 in both. Expected: SSIM above 0.99.
+tensors; between windows the state is float32 in both. Expected: SSIM above 0.99.
 
     python experiments/bfloat16.py WEIGHTS RECORDING...          under a minute each
 """

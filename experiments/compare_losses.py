@@ -1,6 +1,6 @@
 """Which reconstruction loss gives the best network, under equal training budgets?
 
-    python experiments/compare_losses.py RUNS [--images PICTURES] [--steps 400]     about an hour
+    python experiments/compare_losses.py RUNS [--images PICTURES] [--steps 300]     45 minutes
 
 Each candidate trains from the same seed, on the same sequences and for as many steps, in a folder
 of its own under RUNS (an interrupted comparison goes on), and is judged on simulated sequences of

@@ -61,15 +61,19 @@ def on_this_device(name: str) -> str:
     return name if backend == "cpu" else f"{name}_{backend}"
 
 
-def save(name: str, results: dict) -> None:
-    """Writes results/<name>.json with what the numbers depend on."""
-    RESULTS.mkdir(exist_ok=True)
-    machine = {
+def machine() -> dict:
+    """What all numbers depend on."""
+    return {
         "platform": platform.platform(terse=True),
         "processors": os.cpu_count(),
         "device": jax.devices()[0].device_kind,
         "jax": jax.__version__,
     }
+
+
+def save(name: str, results: dict) -> None:
+    """Writes results/<name>.json with what the numbers depend on."""
+    RESULTS.mkdir(exist_ok=True)
     path = RESULTS / f"{name}.json"
-    path.write_text(json.dumps({"machine": machine, **results}, indent=1) + "\n")
+    path.write_text(json.dumps({"machine": machine(), **results}, indent=1) + "\n")
     print(f"written: {path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path}")

@@ -13,11 +13,11 @@ all faults on. Of each recording the first two million events count. Compared ar
     interval   time since the pixel's last event, as a density over its logarithm
 
 To expect: rates of the simulator spread over the recordings' (it moves between 3 and 1,000 pixels
-per second); its ON share near one half and never far from it, while real sensors with unequal
-thresholds come to 0.36 and 0.67; no interval of the simulator's is below the refractory period of
-1 ms (but for hot pixels and noise), while up to a tenth of a DAVIS' and nearly all of a Prophesee
-sensor's before sparklers are. A recording shows no interval longer than itself: those of 10 to
-100 ms seem faster than they are. Faults change fast scenes little, and still ones much.
+per second); its ON share with a median near one half, spread as far as that of real sensors (0.36
+to 0.67); no interval of the simulator's is below the refractory period of 1 ms (but for hot pixels
+and noise), while up to a tenth of a DAVIS' and nearly all of a Prophesee sensor's before sparklers
+are. A recording shows no interval longer than itself: those of 10 to 100 ms seem faster than they
+are. Faults change fast scenes little, and still ones much.
 
 Writes results/simulator_statistics.json and .png.
 """

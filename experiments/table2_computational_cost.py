@@ -3,12 +3,14 @@
 Question: is FireNet as much cheaper than E2VID as the paper says, and is it here? Multiply-adds,
 each counted once, come from three places: by hand (`multiply_adds`), from the convolutions of the
 traced program, and half of the FLOPs that XLA counts in the compiled one (activations included,
-padding's zeros not). E2VID has two kinds of decoder: transposed convolutions as published, and
-bilinear upsampling before a convolution; the paper's count is that of the latter for both. Times
-are one window, batch 1, float32, on a CPU and on a GPU where there is one.
+padding's zeros not; but on a CPU the zeros of `convolution.side_by_side`, a tenth of FireNet's:
+chance, that its column comes near the paper's). E2VID has two kinds of decoder: transposed
+convolutions as published, and bilinear upsampling before a convolution; the paper's count is that
+of the latter for both. Times are one window, batch 1, float32, on a CPU and on a GPU where there is
+one.
 
-Expected: the paper's counts are 9 % (FireNet) and 5.5 % (E2VID) above ours; FireNet takes a third
-to a fifth of the time of E2VID on a CPU, as in the paper (at 240x180: 23 against 85 ms).
+Expected: the paper's counts are 9 % (FireNet) and 5.5 % (E2VID) above ours; FireNet takes a sixth
+to an eighth of the time of E2VID on a CPU (in the paper a quarter to a half).
 
     python experiments/table2_computational_cost.py            5 minutes on two cores
     python experiments/table2_computational_cost.py --quick    1 minute; times mean nothing, saves

@@ -46,7 +46,7 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 import torch
-from harness import RESULTS, interleaved, on_this_device, save, table
+from harness import RESULTS, interleaved, machine, on_this_device, save, table
 from pytorch_firenet import (
     FireNet,
     Trainer,
@@ -581,15 +581,22 @@ def main():
         print("no C++ compiler: torch.compile is left out")
     if options.quick:
         options.runs, options.memory = 3, False
-    measured = {part: MEASURE[part](options) for part in options.parts.split(",")}
+    how = {
+        "machine": machine(),
+        "torch": torch.__version__,
+        "torch threads": torch.get_num_threads(),
+        "compiler": COMPILER,
+        "runs": options.runs,
+    }
+    # Parts may be of different runs: each says for itself how it was measured.
+    measured = {part: how | MEASURE[part](options) for part in options.parts.split(",")}
     if options.quick:
         return None
     name = on_this_device("xla_vs_pytorch")
     path = RESULTS / f"{name}.json"
     before = json.loads(path.read_text()) if path.exists() else {}
     results = {part: before[part] for part in MEASURE if part in before} | measured
-    versions = {"torch": torch.__version__, "torch threads": torch.get_num_threads()}
-    save(name, {**versions, "runs": options.runs, "compiler": COMPILER, **results})
+    save(name, results)
     plot(results, path.with_suffix(".png"))
 
 

@@ -537,8 +537,10 @@ def mean(sequences: dict, method: str, weigh: bool) -> dict:
         ]
         values = [entry["means"][name] for entry in with_it]
         means[name] = float(np.average(values, weights=weights)) if values else None
-        if not values:
-            gaps[name] = there[0]["gaps"][name]
+        if len(with_it) < len(there):  # a mean of fewer sequences is no match for one of all
+            why = next(entry["gaps"][name] for entry in there if name in entry["gaps"])
+            count = len(there) - len(with_it)
+            gaps[name] = f"{why} in {count} of {len(there)} sequences" if values else why
     return {
         "means": means,
         "gaps": gaps,

@@ -94,6 +94,10 @@ def notes(results: dict) -> list[str]:
     }
     if absent:
         said.append("no numbers: " + ", ".join(f"{name} ({why})" for name, why in absent.items()))
+    for method, mean in results["means"]["over sequences"].items():
+        for name, why in mean.get("gaps", {}).items():
+            if mean["means"][name] is not None:
+                said.append(f"{method}: mean {METRICS[name].title} of the others: {why}")
     for sequence, facts in results["sequences"].items():
         found = [entry for entry in facts["methods"].values() if "gap" not in entry]
         empty = max((entry["windows_without_events"] for entry in found), default=0)

@@ -231,7 +231,8 @@ def event_tensors(
 ) -> Iterator[tuple[jax.Array, np.ndarray]]:
     """Recording -> chunks of (tensors (T, 1, H, W, 5) float32, not normalised, times (T,) int64).
 
-    times: microseconds of each window's last event. chunk: T; the last chunk may be shorter.
+    times: microseconds of each window's last event; of its end where it holds none. chunk: T; the
+    last chunk may be shorter, and programs that take it are then compiled for that length too.
     windows: the fields of `windows.Windows`, such as events_per_pixel=0.35 (the default).
     """
     size = 0

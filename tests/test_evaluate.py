@@ -22,7 +22,7 @@ from firenet_jax.methods import Missing, load, recurrent_unet
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pytorch_file import CheckpointError
 from firenet_jax.readers import open_recording
-from firenet_jax.report import METRICS, steps
+from firenet_jax.report import METRICS, notes, steps
 from firenet_jax.tensors import normalise, pack, voxelise
 from firenet_jax.windows import Window
 
@@ -139,6 +139,9 @@ def test_means_over_sequences_and_over_frames(evaluated):
         assert b["means"]["temporal_error"] is None and b["gaps"]["temporal_error"] == "no flow"
         mean = over["over sequences"]["means"]["temporal_error"]
         assert mean == pytest.approx(a["means"]["temporal_error"])
+        fewer = over["over sequences"]["gaps"]["temporal_error"]
+        assert fewer == "no flow in 1 of 2 sequences"
+        assert sum(name in line and fewer in line for line in notes(results)) == 1
 
 
 def no_constant(name):
