@@ -163,17 +163,17 @@ def _index(path: Path) -> Index:
             )
         times, rows = _microseconds(times), np.zeros(len(names), np.int64)
         # Not the attribute event_idx: programs differ in what it counts, by one.
-        for events in checked(_stamps(stamps), path, None, None):
+        for events in checked(_stamps(path, stamps), path, None, None):
             rows += np.searchsorted(events.t, times)
     return Index(names, times, rows)
 
 
-def _stamps(column: h5py.Dataset) -> Iterator[Events]:
+def _stamps(path: Path, column: h5py.Dataset) -> Iterator[Events]:
     """Events of which only the time is known."""
     for start in range(0, len(column), CHUNK):
-        t = _microseconds(column[start : start + CHUNK])
+        t = column[start : start + CHUNK]
         nothing = np.zeros(len(t), np.int16)
-        yield Events.of(t, nothing, nothing, nothing)
+        yield to_events(path, start, t, nothing, nothing, nothing)
 
 
 def _microseconds(times: np.ndarray) -> np.ndarray:

@@ -37,7 +37,7 @@ class Plan(NamedTuple):
     first: int  # of these, the frames first <= i < last count
     last: int
     origin: int  # microseconds: the sequence's beginning
-    span: tuple[float, float | None]  # seconds after the first event: what is reconstructed
+    begin: int  # microseconds: reconstruction begins here
 
 
 class Comparison(NamedTuple):

@@ -16,6 +16,7 @@ A file appears under its name when it is whole, so a run that was interrupted go
 
 import dataclasses
 import importlib.metadata
+import itertools
 import json
 import math
 import shutil
@@ -440,10 +441,10 @@ def simulate_clip(settings: Simulate) -> Path:
     except OSError as error:
         raise OutputError(f"{path.parent}: cannot make this folder ({error.strerror})") from error
     size = parse_size(settings.sensor_size)
-    first = next(read_clip(clip, size), None)
-    if first is None:
-        raise ValueError(f"{clip}: holds no pictures: name a video file that does")
-    height, width = first.image.shape
+    first = list(itertools.islice(read_clip(clip, size), 2))
+    if len(first) < 2:
+        raise ValueError(f"{clip}: holds fewer than two pictures, so no change: name a video file")
+    height, width = first[0].image.shape
     sensor = with_faults(settings.sensor) if settings.faults else settings.sensor
     camera = random_sensor(
         jax.random.key(settings.seed), height=height, width=width, settings=sensor
@@ -478,7 +479,7 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
     first = last = None
     try:
         with av.open(str(path)) as container:
-            if not container.streams.video:
+            if not container.streams.video or container.format.name == "tty":  # any text is
                 raise ValueError(f"{path}: holds no video, only sound or text: name a video file")
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"

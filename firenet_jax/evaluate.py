@@ -51,12 +51,13 @@ from firenet_jax.files import (
     write_arrays,
     write_text,
 )
-from firenet_jax.filters import between, check_span
+from firenet_jax.filters import check_span
 from firenet_jax.methods import NAMES, Method, Missing, digest, load
 from firenet_jax.overlap import ahead
 from firenet_jax.readers import FORMATS, open_recording
 from firenet_jax.readers.hdf5 import opened
 from firenet_jax.report import METRICS
+from firenet_jax.scenes import check_seed
 from firenet_jax.video import write_video
 from firenet_jax.windows import Window, Windows, cut
 
@@ -149,6 +150,7 @@ class Evaluate:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise ValueError(f"{name} is {value}, but must be 0 or more")
+        check_seed(self.seed)
         check_span(self.start, self.stop)
         parse_size(self.sensor_size)
 
@@ -282,8 +284,8 @@ def plan(name: str, recording: Recording, settings: Evaluate) -> Plan:
     times = np.asarray(frames.times, np.int64)
     if (np.diff(times) < 0).any():
         raise Gap("times of frames run backwards")
-    event = begin = first_event(recording, times)
-    origin = min(event, int(times[0]))
+    begin = first_event(recording, times)
+    origin = min(begin, int(times[0]))
     numbers = np.arange(len(times))
     if settings.keep_ratio < 1:
         count = max(2, int(settings.keep_ratio * len(times)))
@@ -301,10 +303,7 @@ def plan(name: str, recording: Recording, settings: Evaluate) -> Plan:
     warm = np.searchsorted(times, origin + round(1e6 * (start - settings.warm_up)), "right") - 1
     if warm >= 0:
         begin = max(begin, int(times[min(warm, first - 1)]))
-    # Windows of other kinds that the last frame would cut are left whole.
-    end = (int(times[last - 1]) - event) / 1e6 if settings.between_frames else None
-    span = ((begin - event) / 1e6, end)
-    return Plan(name, recording, numbers, times, first, last, origin, span)
+    return Plan(name, recording, numbers, times, first, last, origin, begin)
 
 
 def interval(path: Path, settings: Evaluate) -> tuple[float, float]:
@@ -337,8 +336,9 @@ def first_event(recording: Recording, times: np.ndarray) -> int:
 def windows_of(plan: Plan, settings: Evaluate) -> Iterator[Window]:
     recording = plan.recording
     frames = Frames(plan.times, recording.frames.read)
-    chunks = between(recording.events(), *plan.span)
-    return cut(dataclasses.replace(recording, frames=frames), settings.windows, chunks)
+    later = (e.select(slice(np.searchsorted(e.t, plan.begin), None)) for e in recording.events())
+    recording = dataclasses.replace(recording, frames=frames)
+    return cut(recording, settings.windows, filter(len, later), plan.begin)
 
 
 def read_flow(plan: Plan, place: int) -> np.ndarray | None:

@@ -10,6 +10,7 @@ sum of distances that need nothing, by default about as large as LPIPS is for a 
 (0.4 to 0.5), so that lambda_TC means the same.
 """
 
+import math
 from dataclasses import dataclass
 
 import jax
@@ -53,6 +54,11 @@ class Loss:
     sequence whose state is warm from the start."""
     L: int = 20
     """Last image of a sequence, counted from 0."""
+
+    def __post_init__(self):
+        for name in (*DISTANCES, "lambda_tc", "l0", "L"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}, but must be 0 or more")
 
 
 DISTANCES = {

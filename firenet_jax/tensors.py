@@ -74,7 +74,10 @@ def pack(
     if counts.sum() > size:
         raise ValueError(f"{counts.sum()} events do not fit into a list of {size}")
     if len(flat) >= 2**15:
-        raise ValueError(f"{shape} windows are too many for one chunk")
+        raise ValueError(
+            f"a chunk of {shape[0]} x {shape[1]} windows is too large: ask for a smaller chunk or "
+            f"batch, fewer than {2**15} windows at once"
+        )
     if bounds is None:
         bounds = np.array([(w.t[0], w.t[-1]) if len(w) else (0, 0) for w in flat], np.int64)
     t_min, t_max = np.asarray(bounds, np.int64).reshape(-1, 2).T

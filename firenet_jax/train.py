@@ -23,6 +23,7 @@ import contextlib
 import dataclasses
 import itertools
 import json
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -57,7 +58,7 @@ from firenet_jax.devices import (
 )
 from firenet_jax.events import logger
 from firenet_jax.files import differences, write_text
-from firenet_jax.losses import Loss, sequence_loss
+from firenet_jax.losses import DISTANCES, Loss, sequence_loss
 from firenet_jax.network import (
     CONVOLVED,
     State,
@@ -172,19 +173,23 @@ class Train:
             "validate_every",
         )
         for name in positive:
-            if not getattr(self, name) > 0:
+            if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} is {getattr(self, name)}, but must be more than 0")
         if not self.loss.l0 < self.windows <= self.loss.L + 1:
             raise ValueError(
                 f"windows is {self.windows}, but the loss is over more than {self.loss.l0} and at "
                 f"most {self.loss.L + 1} of them"
             )
+        if not any(getattr(self.loss, name) for name in DISTANCES):
+            raise ValueError(f"no distance has a weight: pass one of {', '.join(DISTANCES)}")
         if self.crop < SMALLEST:
             raise ValueError(
                 f"crop is {self.crop} pixels, but images smaller than {SMALLEST} cannot be judged"
             )
         check_range("motion", self.motion)
         check_seed(self.seed)
+        if not self.save_every >= 0:
+            raise ValueError(f"save_every is {self.save_every} seconds, but must be 0 or more")
         if not 0 <= self.procedural <= 1:
             raise ValueError(f"procedural is {self.procedural}, but is a part of the textures, 0-1")
         if not 0 <= self.warmup < self.steps:

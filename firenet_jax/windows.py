@@ -15,7 +15,8 @@ import tyro
 
 from firenet_jax.events import Events, Recording, RecordingError, concatenate, logger
 
-APART = 3_600_000_000  # microseconds between events and frames of one clock, at most
+APART = 3_600_000_000  # microseconds between events of one clock, or events and frames, at most
+MOST = 2**31 - 1
 
 
 class Window(NamedTuple):
@@ -50,8 +51,8 @@ class Windows:
             )
         for name in ("events", "events_per_pixel", "duration", "step"):
             value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise ValueError(f"{name} is {value}, but must be more than 0")
+            if value is not None and not 0 < value <= MOST:
+                raise ValueError(f"{name} is {value:g}, but must be more than 0, at most {MOST}")
         if self.step is not None:
             if self.between_frames:
                 raise ValueError("step overlaps windows of a fixed size, not those between frames")
@@ -71,12 +72,19 @@ class Windows:
         return max(1, round((self.events_per_pixel or 0.35) * pixels))
 
 
-def cut(recording: Recording, windows: Windows, chunks: Iterable[Events] | None = None):
-    """Recording -> iterator of `Window`, as `windows` says.
+def cut(
+    recording: Recording,
+    windows: Windows,
+    chunks: Iterable[Events] | None = None,
+    begin: int | None = None,
+) -> Iterator[Window]:
+    """Recording -> its windows, as `windows` says.
 
     chunks: the recording's events after filters; None: as they are.
-    Raises RecordingError where windows between frames are asked of a recording without frames,
-    ValueError where the step is longer than the window.
+    begin: microseconds, where the first window in time begins; None: at the first event.
+    Raises RecordingError where windows between frames are asked of a recording without frames, and,
+    of windows in time, where no event comes for more than an hour; ValueError where the step is
+    longer than the window.
     """
     chunks = iter(recording.events() if chunks is None else chunks)
     if windows.between_frames:
@@ -86,12 +94,16 @@ def cut(recording: Recording, windows: Windows, chunks: Iterable[Events] | None 
                 f"{recording.path}: windows between frames need a recording with two frames or "
                 "more, each at a time of its own: use --events-per-pixel or --duration"
             )
-        return _by_time(chunks, lambda first: _frame_spans(recording.path, times, first))
+        return _by_time(
+            recording.path, chunks, begin, lambda first: _frame_spans(recording.path, times, first)
+        )
     if windows.duration is not None:
         step = windows.duration if windows.step is None else windows.step
         if step > windows.duration:
             raise ValueError(f"step of {step} ms is longer than the window, {windows.duration} ms")
-        return _by_time(chunks, lambda first: _grid_spans(windows.duration, step, first))
+        return _by_time(
+            recording.path, chunks, begin, lambda first: _grid_spans(windows.duration, step, first)
+        )
     count = windows.count(recording.pixels)
     step = count if windows.step is None else int(windows.step)
     if step > count:
@@ -129,8 +141,8 @@ def _by_count(chunks: Iterator[Events], count: int, step: int) -> Iterator[Windo
         yield _window(concatenate(held), 0, size)
 
 
-def _by_time(chunks: Iterator[Events], spans) -> Iterator[Window]:
-    """Windows of the events with start <= t < stop, for each span of `spans(first time)`.
+def _by_time(path, chunks: Iterator[Events], begin: int | None, spans) -> Iterator[Window]:
+    """Windows of the events with start <= t < stop, for each span of `spans(begin)`.
 
     Ends with the first window that reaches the recording's last event.
     """
@@ -138,7 +150,7 @@ def _by_time(chunks: Iterator[Events], spans) -> Iterator[Window]:
     if first is None:
         return
     held, ended = first, False
-    for start, stop in spans(int(first.t[0])):
+    for start, stop in spans(int(first.t[0]) if begin is None else begin):
         more, last = [], held.t[-1] if len(held) else None
         while not ended and (last is None or last < stop):
             chunk = next(chunks, None)
@@ -152,6 +164,11 @@ def _by_time(chunks: Iterator[Events], spans) -> Iterator[Window]:
         yield _window(held, a, b, stop)
         if ended and b == len(held):
             return
+        if held.t[b] - stop > APART:  # a broken time: there may be billions of windows up to it
+            raise RecordingError(
+                f"{path}: no event from {stop / 1e6:.6f} to {held.t[b] / 1e6:.6f} s, more than an "
+                "hour: leave one side out with --start or --stop, or use --events-per-pixel"
+            )
         held = held.select(slice(a, None))
 
 

@@ -6,6 +6,7 @@ import h5py
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 
 from firenet_jax import cli, dataset
 from firenet_jax.dataset import Picture, Simulate, read_clip, rounded_flow, run, write_sequence
@@ -354,6 +355,8 @@ def bad_lines(folder):
     (folder / "taken/letter.txt").write_text("mine")
     (folder / "file").write_text("mine")
     (folder / "clip.mp4").write_bytes(b"no video at all" * 50)
+    (folder / "events.txt").write_text("0.1 3 2 1\n" * 500)
+    Image.fromarray(np.zeros((16, 16), np.uint8)).save(folder / "one.png")
     (folder / "damaged").mkdir()
     (folder / "damaged/settings.json").write_text("{")
     run(settings(folder / "other", sequences=1, validation=0))
@@ -374,6 +377,8 @@ def bad_lines(folder):
         ("-o out.h5 --video missing.mp4", "cannot be read as a video"),
         ("-o out.h5 --video empty", "cannot be read as a video"),
         ("-o out.h5 --video sound.wav", "holds no video"),
+        ("-o out.h5 --video events.txt", "holds no video"),
+        ("-o out.h5 --video one.png", "fewer than two pictures"),
     ]
 
 

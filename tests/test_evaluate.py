@@ -273,8 +273,8 @@ def test_intervals_of_the_event_camera_dataset(tmp_path):
 
     def counted(**changes):
         found = plan("a", recording, Evaluate((path,), tmp_path / "out", **changes))
-        begin = found.span[0] + events.t[0] / 1e6
-        return found.times[found.first] / 1e6, found.times[found.last - 1] / 1e6, begin
+        times = found.times[found.first], found.times[found.last - 1], found.begin
+        return tuple(time / 1e6 for time in times)
 
     assert counted() == pytest.approx((1.0, 2.5, events.t[0] / 1e6))
     assert counted(start=0.0) == pytest.approx((0.1, 3.0, events.t[0] / 1e6))
@@ -284,6 +284,25 @@ def test_intervals_of_the_event_camera_dataset(tmp_path):
     assert counted(start=1.0, stop=1.05, warm_up=0.2)[:2] == pytest.approx((1.0, 1.0))
     with pytest.raises(Gap, match="no frames from 7 to 8 s"):
         counted(start=7.0, stop=8.0)
+
+
+def test_a_silent_camera_leaves_the_frames_that_count_as_they_are(folder, tmp_path):
+    """The windows without events at the ends of what is asked for are windows too."""
+    events = events_of(24_000, 6 * PERIOD)
+    loud = (events.t < 1.5 * PERIOD) | (events.t >= 4.5 * PERIOD)
+    path = write(tmp_path / "quiet.h5", 6, events.select(loud))
+
+    def numbers(**changes):
+        choices = {"data": (path,), "methods": "hf", **changes}
+        found = run(settings(folder, tmp_path / f"{changes}", **choices))
+        return found["sequences"]["quiet"]["methods"]["hf"]["frame_numbers"]
+
+    frames = numbers()
+    assert {3, 4} < set(frames)
+    period = PERIOD / 1e6
+    assert numbers(stop=4.1 * period) == [n for n in frames if n <= 4]
+    late = [n for n in frames if n >= 3]
+    assert numbers(start=2.9 * period) == numbers(start=2.9 * period, warm_up=0.0) == late
 
 
 def test_keep_ratio_thins_out_frames_alike_for_every_method(folder, tmp_path):
@@ -425,7 +444,7 @@ def test_weights_that_are_not_there_or_not_finite(folder, tmp_path):
     "choice, message",
     [
         ({"data": ()}, "no data"), ({"methods": " ,"}, "no methods: choose from firenet"),
-        ({"keep_ratio": 0.0}, "keep ratio"),
+        ({"keep_ratio": 0.0}, "keep ratio"), ({"seed": -1}, "seed is -1"),
         ({"warm_up": -1.0}, "warm_up"), ({"tolerance": float("nan")}, "tolerance"),
         ({"start": 3.0, "stop": 2.0}, "stop"), ({"stop": float("inf")}, "leave it out"),
         ({"start": float("nan")}, "start is nan"), ({"events": 0}, "events"),

@@ -92,6 +92,14 @@ def test_defaults_are_those_of_the_paper():
         sequence_loss(truths, truths, *flow)
 
 
+@pytest.mark.parametrize(
+    "choice", [{"l1": -1.0}, {"ssim": np.nan}, {"lambda_tc": -2.0}, {"nlpd": np.inf}, {"l0": -3}]
+)
+def test_weights_that_cannot_be(choice):
+    with pytest.raises(ValueError, match=f"{next(iter(choice))} is .* must be 0 or more"):
+        Loss(**choice)
+
+
 def test_the_first_flow_is_not_used():
     images, truths, displacements, visible = sequence()
     expected, _ = sequence_loss(images, truths, displacements, visible, replace(SHORT, l0=0))

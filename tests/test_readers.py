@@ -83,6 +83,7 @@ def test_what_is_no_recording(tmp_path):
     refused(write(tmp_path / "empty.txt", ""), "is empty")
     refused(write(tmp_path / "film.mp4", b"x"), "not a recording of a known format")
     refused(tmp_path, "not a recording of a known format")
+    refused(Path("/dev/null"), "is a pipe or device")
 
 
 def test_sensor_size_is_inferred_with_a_notice(tmp_path, caplog):
@@ -204,8 +205,19 @@ def test_text_in_the_unit_that_its_names_tell(tmp_path, caplog, name, unit, whol
     assert "read as microseconds" not in caplog.text
 
 
-def test_a_sensor_of_no_pixels_is_refused(tmp_path):
-    refused(write(tmp_path / "a.txt", "0 0\n0.1 3 2 1\n"), "outside the sensor of 0x0", size=None)
+@pytest.mark.parametrize("size", ["0 0", "320 0", "999999 180"])
+def test_a_sensor_that_cannot_be_is_refused(tmp_path, size):
+    said = "states a sensor of " + size.replace(" ", "x")
+    refused(write(tmp_path / "a.txt", f"{size}\n0.1 3 2 1\n"), said, size=None)
+
+
+def test_whole_seconds_are_said_as_they_may_be_microseconds(tmp_path, caplog):
+    for name, step, said in (("us", 1.0, True), ("seconds", 0.125, False)):
+        lines = "\n".join(f"{step * k!r} 1 2 1" for k in range(1000))
+        caplog.clear()
+        t = events_of(write(tmp_path / f"{name}.txt", lines), (240, 320)).t
+        assert t.tolist() == [round(1e6 * step * k) for k in range(1000)]
+        assert ("t_us x y p" in caplog.text) == said
 
 
 @pytest.mark.parametrize(
@@ -458,6 +470,10 @@ def test_hdf5_dsec(tmp_path):
             file.create_dataset(f"events/{name}", **packed)
         file["t_offset"] = 5_000_000_000
     check(tmp_path / "events.h5", t=T + 5_000_000_000)
+    with h5py.File(tmp_path / "events.h5", "a") as file:
+        del file["t_offset"]
+        file["t_offset"] = [7_000_000]
+    check(tmp_path / "events.h5", t=T + 7_000_000)
     assert open_recording(tmp_path / "events.h5", (240, 320)).count == 5
 
 
@@ -505,6 +521,10 @@ def test_wrong_hdf5(tmp_path):
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["events/CD"] = X
     refused(tmp_path / "other.h5", "holds events, events/CD, expected the columns events/xs")
+    with h5py.File(write_cnn(tmp_path / "group.h5"), "a") as file:
+        del file["events/xs"]
+        file.create_group("events/xs")
+    refused(tmp_path / "group.h5", "expected the columns events/xs")
     with h5py.File(tmp_path / "shape.h5", "w") as file:
         file["davis/left/events"] = np.zeros((4, 3))
     refused(tmp_path / "shape.h5", "has the shape (4, 3), expected (N, 4)")
@@ -539,6 +559,11 @@ def test_cnn_with_a_strange_sensor_size(tmp_path, size):
     with h5py.File(path, "a") as file:
         file.attrs["sensor_resolution"] = size
     refused(path)
+
+
+@pytest.mark.parametrize("size", [[-24, 32], [0, 0], [100_000, 100_000]])
+def test_cnn_with_a_sensor_that_cannot_be(tmp_path, size):
+    refused(write_cnn(tmp_path / "a.h5", size=size), "states a sensor of", size=None)
 
 
 def test_hdf5_with_names_that_are_no_text(tmp_path):
@@ -628,6 +653,16 @@ def test_ncaltech(tmp_path, monkeypatch):
         monkeypatch.setattr(ncaltech, "CHUNK", chunk)
         check(path, [100, 8192 + 7, 2 * 8192 + 9], [1, 2, 3], [1, 2, 3], [1, 0, 1])
     refused(write(tmp_path / "cut.bin", path.read_bytes()[:-1]), "24 bytes", "multiple of 5")
+
+
+@pytest.mark.parametrize("name", ["a.bin", "a.dat"])
+def test_a_file_that_grows_is_read_as_far_as_it_went(tmp_path, name):
+    header = b"" if name == "a.bin" else b"% Height 240\n% Width 320\n\x00\x08"
+    event = bin_event(5, 1, 2, 1) if name == "a.bin" else struct.pack("<II", 5, 2 << 14 | 1)
+    recording = open_recording(write(tmp_path / name, header + 4 * event), (240, 320))
+    with (tmp_path / name).open("ab") as file:
+        file.write(event[:3])
+    assert [events.t.tolist() for events in recording.events()] == [[5] * 4]
 
 
 # ---------------------------------------------------------------- DAT

@@ -256,6 +256,9 @@ def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypa
     "choice, message",
     [
         ({"batch": 0}, "batch"), ({"learning_rate": -1.0}, "learning_rate"),
+        ({"learning_rate": float("inf")}, "learning_rate"),
+        ({"loss": Loss(l1=0, nlpd=0, haarpsi=0, l0=1)}, "no distance has a weight"),
+        ({"save_every": float("nan")}, "save_every is nan"),
         ({"windows": 22}, "at most 21"), ({"windows": 1}, "more than 1"),
         ({"warmup": 6}, "warmup"), ({"warmup": -5}, "warmup"),
         ({"log_every": 0}, "log_every"), ({"validate_every": 0}, "validate_every"),

@@ -97,6 +97,23 @@ def test_by_duration_leaves_no_gap_and_no_overlap(duration):
     assert all(stop == start for (_, stop), (start, _) in itertools.pairwise(spans))
 
 
+def test_windows_in_time_from_where_one_says():
+    recording = recording_of([25, 41], frames=[0, 10, 20, 30, 40])
+    windows = list(cut(recording, Windows(between_frames=True), begin=10))
+    assert [(w.time, len(w.events)) for w in windows] == [(20, 0), (25, 1), (40, 0), (41, 1)]
+    windows = list(cut(recording, Windows(duration=0.01), begin=20))
+    assert [(w.time, len(w.events)) for w in windows] == [(25, 1), (40, 0), (41, 1)]
+
+
+@pytest.mark.parametrize("windows", [{"duration": 10}, {"between_frames": True}])
+def test_a_time_far_from_the_others_is_named_not_reached_window_by_window(windows):
+    recording = recording_of([0, 100, 4 * 10**9], frames=[0, 100])
+    found = cut(recording, Windows(**windows))
+    assert next(found).events.t.tolist()[0] == 0
+    with pytest.raises(RecordingError, match="memory: no event from .* to 4000.000000 s"):
+        list(found)
+
+
 @pytest.mark.parametrize("frames, events", [((0, 100), 10**16), ((10**16, 10**16 + 100), 0)])
 def test_frames_on_another_clock_are_refused(frames, events):
     recording = recording_of(events + np.arange(20), frames=frames)
@@ -124,6 +141,8 @@ def test_no_events_no_windows():
     [
         ({"events": 5, "duration": 3}, "choose one"),
         ({"events": 0}, "more than 0"),
+        ({"events": 10**23}, "at most 2147483647"),
+        ({"events_per_pixel": 1e308}, "at most 2147483647"),
         ({"duration": -1}, "more than 0"),
         ({"duration": float("nan")}, "more than 0"),
         ({"duration": 0.0001}, "whole microseconds"),

@@ -63,6 +63,10 @@ def open_recording(path: str | Path, sensor_size: tuple[int, int] | None = None)
     path = Path(path)
     if not path.exists():
         raise RecordingError(f"{path}: there is no such file or folder: check the path")
+    if not (path.is_file() or path.is_dir()):
+        raise RecordingError(
+            f"{path}: is a pipe or device, but a recording is read more than once: make it a file"
+        )
     if path.is_file() and path.stat().st_size == 0:
         raise RecordingError(f"{path}: the file is empty: copy or download it again")
     for name in FORMATS:
@@ -75,7 +79,7 @@ def open_recording(path: str | Path, sensor_size: tuple[int, int] | None = None)
             f"{path}: not a recording of a known format: expected text or zip, an ECD or EVREAL "
             "folder, HDF5, N-Caltech101 .bin, .dat, .raw, .aedat4, .es, or a ROS bag"
         )
-    height, width = sensor_size or source.size or _infer_size(path, source)
+    height, width = sensor_size or _stated(path, source) or _infer_size(path, source)
     return Recording(
         path=path,
         format=source.format,
@@ -85,6 +89,19 @@ def open_recording(path: str | Path, sensor_size: tuple[int, int] | None = None)
         count=source.count,
         frames=source.frames,
     )
+
+
+def _stated(path: Path, source: Source) -> tuple[int, int] | None:
+    """The sensor's size as the file states it; None where it does not."""
+    if source.size is None:
+        return None
+    height, width = map(int, source.size)
+    if not (0 < height <= REACH and 0 < width <= REACH):
+        raise RecordingError(
+            f"{path}: states a sensor of {width}x{height} pixels, expected sides of 1 to {REACH}: "
+            "pass the right --sensor-size WIDTHxHEIGHT"
+        )
+    return height, width
 
 
 def _infer_size(path: Path, source: Source) -> tuple[int, int]:

@@ -58,7 +58,7 @@ def read(path: Path) -> Source:
         )
     layout = VERSIONS[version]
     size = header_size(header)
-    return Source("Prophesee DAT", lambda: _events(path, start, layout), size, count)
+    return Source("Prophesee DAT", lambda: _events(path, start, count, layout), size, count)
 
 
 def read_header(file: BufferedReader) -> str:
@@ -80,11 +80,12 @@ def header_size(header: str) -> tuple[int, int] | None:
     return (int(height[1]), int(width[1])) if height and width else None
 
 
-def _events(path: Path, start: int, layout: Layout) -> Iterator[Events]:
+def _events(path: Path, start: int, count: int, layout: Layout) -> Iterator[Events]:
     row, last = 0, 0
     with open(path, "rb") as file:
         file.seek(start)
-        while data := file.read(8 * CHUNK):
+        # Not to the end: a file that is still being written may end within an event by now.
+        while data := file.read(8 * min(CHUNK, count - row)):
             t, fields = np.frombuffer(data, "<u4").reshape(-1, 2).T
             t = unwrap(t, 32, last)
             x = fields & ((1 << layout.x_bits) - 1)

@@ -60,7 +60,7 @@ def _layout(path: Path, file: h5py.File) -> str:
     events = file.get("events")
     if isinstance(events, h5py.Group):
         for layout, names in COLUMNS.items():
-            if all(name in events for name in names):
+            if all(isinstance(events.get(name), h5py.Dataset) for name in names):
                 return layout
     if f"{MVSEC}/events" in file:
         return "MVSEC"
@@ -95,7 +95,7 @@ def _reader(path: Path, file: h5py.File, layout: str) -> tuple[Callable[[slice],
     if len({column.shape for column in columns}) != 1 or columns[0].ndim != 1:
         found = ", ".join(f"{column.name} {column.shape}" for column in columns)
         raise RecordingError(f"{path}: its columns differ in length: {found}")
-    start = int(file["t_offset"][()]) if "t_offset" in file and layout == "DSEC" else 0
+    start = int(np.ravel(file["t_offset"])[0]) if "t_offset" in file and layout == "DSEC" else 0
 
     def read(rows: slice) -> Events:
         t, x, y, p = (column[rows] for column in columns)

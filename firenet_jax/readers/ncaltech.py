@@ -33,13 +33,14 @@ def read(path: Path) -> Source:
             f"{path}: has {size} bytes, expected a multiple of 5: the file is cut off or of "
             "another format"
         )
-    return Source("N-Caltech101", lambda: _events(path))
+    return Source("N-Caltech101", lambda: _events(path, size))
 
 
-def _events(path: Path) -> Iterator[Events]:
+def _events(path: Path, size: int) -> Iterator[Events]:
     row, marks = 0, 0
     with open(path, "rb") as file:
-        while data := file.read(5 * CHUNK):
+        # Not to the end: a file that is still being written may end within an event by now.
+        while data := file.read(min(5 * CHUNK, size - file.tell())):
             x, y, high, middle, low = np.frombuffer(data, np.uint8).reshape(-1, 5).T
             t = (high & 0x7F).astype(np.int64) << 16 | middle.astype(np.int64) << 8 | low
             is_mark = y == MARK

@@ -158,6 +158,11 @@ def _sniff(path: Path, member: str | None) -> Layout:
     types["t"] = pa.int64() if rows and whole("t") and fine else pa.float64()
     if types["t"] == pa.int64() and unit is None:
         logger.warning("%s: times without a decimal point: read as microseconds", path)
+    elif unit is None and len(rows) == SNIFFED and _whole_seconds(rows, names.index("t")):
+        logger.warning(
+            "%s: times with a decimal point: read as seconds, though whole ones; if they are "
+            "microseconds, let the file begin with a line of names, such as t_us x y p", path,
+        )  # fmt: skip
     return Layout(skip, size, names, separator, types, unit)
 
 
@@ -183,6 +188,11 @@ def _names(line: str) -> tuple[tuple[str, ...], float | None] | None:
     if any(named.count(key) != 1 for key in NAMES):
         return None
     return tuple(named), told[named.index("t")]
+
+
+def _whole_seconds(rows: list[list[str]], column: int) -> bool:
+    words = [row[column] for row in rows if column < len(row) and _is_number(row[column])]
+    return len(set(words)) > 1 and all(float(word).is_integer() for word in words)
 
 
 def _is_number(word: str) -> bool:
