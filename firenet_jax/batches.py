@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.events import Events, RecordingError, checked, event_number, logger
-from firenet_jax.readers import CHUNK, microseconds, to_events, to_frame
+from firenet_jax.readers import CHUNK, frame_times, to_events, to_frame
 from firenet_jax.readers.hdf5 import opened
 from firenet_jax.sensor import Simulation
 from firenet_jax.tensors import BINS, Packed, pack, voxelise
@@ -161,7 +161,7 @@ def _index(path: Path) -> Index:
                 f"{path}, image {image}: its time is {times[image]}, not after {times[image - 1]}, "
                 "that of the image before: the file is damaged or of another format"
             )
-        times, rows = _microseconds(times), np.zeros(len(names), np.int64)
+        times, rows = frame_times(path, times), np.zeros(len(names), np.int64)
         # Not the attribute event_idx: programs differ in what it counts, by one.
         for events in checked(_stamps(path, stamps), path, None, None):
             rows += np.searchsorted(events.t, times)
@@ -174,10 +174,6 @@ def _stamps(path: Path, column: h5py.Dataset) -> Iterator[Events]:
         t = column[start : start + CHUNK]
         nothing = np.zeros(len(t), np.int16)
         yield to_events(path, start, t, nothing, nothing, nothing)
-
-
-def _microseconds(times: np.ndarray) -> np.ndarray:
-    return times.astype(np.int64) if times.dtype.kind in "iu" else microseconds(times)
 
 
 # ---- Examples

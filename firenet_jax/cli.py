@@ -43,8 +43,9 @@ def _return_freed_memory() -> None:
     By default it comes to keep blocks of up to 32 MB in a heap for each thread; those heaps
     fragment, and a long reconstruction grows by a third of its memory before it settles.
     """
-    with contextlib.suppress(OSError, AttributeError):  # another C library
-        ctypes.CDLL(None).mallopt(-3, 1 << 22)  # M_MMAP_THRESHOLD
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):  # another C library
+            ctypes.CDLL(None).mallopt(-3, 1 << 22)  # M_MMAP_THRESHOLD
 
 
 HUGE_PAGES = "glibc.malloc.hugetlb=1"

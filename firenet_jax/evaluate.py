@@ -45,6 +45,7 @@ from firenet_jax.equalise import Kind, equalise
 from firenet_jax.events import Frames, Recording, RecordingError, logger, parse_size
 from firenet_jax.files import (
     OutputError,
+    differences,
     identity,
     named,
     read_arrays,
@@ -447,22 +448,15 @@ def open_folder(settings: Evaluate, records: dict[tuple[str, str], dict]) -> dic
             continue
         try:
             saved = json.loads(path.read_text())
-            other = sorted(
-                name
-                for name in {*record, *saved["record"]}
-                if saved["record"].get(name) != record.get(name)
-            )
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            other = differences(saved["record"], record)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise OutputError(f"{path} is damaged ({error}): remove it") from error
         if not other:
             done[key] = saved["result"]
         elif not settings.overwrite:
-            pairs = ", ".join(
-                f"{name} was {saved['record'].get(name)}, now {record.get(name)}" for name in other
-            )
             raise OutputError(
-                f"{path} was made with other settings ({pairs}): choose another output, or pass "
-                "--overwrite to compute it again"
+                f"{path} was made with other settings ({', '.join(other)}): choose another output, "
+                "or pass --overwrite to compute it again"
             )
     for key in records:
         try:

@@ -44,12 +44,16 @@ class Events:
 
     @classmethod
     def of(cls, t, x, y, p) -> "Events":
-        """Columns of any integer dtype -> Events with the dtypes above."""
+        """Columns of any integer dtype -> Events with the dtypes above; p: bool, 0 and 1, or -1
+        and 1. Raises ValueError for times that are no whole microseconds."""
+        t, p = np.asarray(t), np.asarray(p)
+        if t.size and t.dtype.kind not in "iu":
+            raise ValueError(f"times are {t.dtype}, expected whole microseconds: 1e6 times seconds")
         return cls(
-            np.asarray(t, np.int64),
+            t.astype(np.int64, copy=False),
             np.asarray(x, np.int16),
             np.asarray(y, np.int16),
-            np.asarray(p, bool),
+            p if p.dtype == bool else p > 0,
         )
 
     @classmethod

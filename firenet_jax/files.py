@@ -49,6 +49,26 @@ def writing(path: Path):
         ) from error
 
 
+def alone(file, path: Path) -> None:
+    """Holds an open file until it is closed or its process ends, however it does.
+
+    Raises OutputError where another run holds it. Does nothing where there are no such locks.
+    """
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        raise OutputError(
+            f"{path}: another run is writing it: wait for that, or choose another output"
+        ) from None
+    except OSError:  # some network disks
+        return
+
+
 def write_text(path: Path, text: str) -> None:
     """Who reads the file, while this runs or after it was killed, finds the old text or the new."""
     beside = partial_name(path)

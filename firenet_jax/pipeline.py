@@ -378,6 +378,7 @@ def reconstruct_jobs(
             progress.set_postfix_str(f"{pictures_done} pictures", refresh=False)
     finally:
         finished.close()
+        chunks.close()  # else its thread would live as long as an exception that holds this frame
         for running in open_jobs.values():
             running.writer.abandon()
     return pictures_done, events_done

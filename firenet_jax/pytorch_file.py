@@ -252,6 +252,8 @@ def _ordered_dict(pairs=()) -> dict:
 
 
 def _size(sizes=()) -> tuple:
+    if len(sizes) > 64:  # thousands of long ones would take gigabytes
+        raise TypeError(f"a tensor of {len(sizes)} dimensions")
     return tuple(sizes)
 
 

@@ -12,9 +12,10 @@ data flows.
 """
 
 import itertools
+import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -33,7 +34,11 @@ CAPACITIES = tuple(2**14 * 8**k for k in range(6))
 
 BLOCK, BLOCKS = 2**17, 8  # events that vote at once on a CPU, and how many such steps in a row
 
-HELPER = ThreadPoolExecutor(1, "pack")  # copies beside the thread that packs
+
+@cache
+def _helper(process: int) -> ThreadPoolExecutor:
+    """Copies beside the thread that packs; a forked process has none of its parent's threads."""
+    return ThreadPoolExecutor(1, "pack")
 
 
 class Packed(NamedTuple):
@@ -109,7 +114,7 @@ def pack(
             np.copyto(packed.t[place], times, casting="unsafe")  # modulo 2^32
 
     # Half of the bytes are times: of a long list, another thread copies them meanwhile.
-    times_copied = HELPER.submit(copy_times) if size >= BLOCK else copy_times()
+    times_copied = _helper(os.getpid()).submit(copy_times) if size >= BLOCK else copy_times()
     for number, window in enumerate(flat):
         place = slice(starts[number], stops[number])
         packed.x[place] = window.x

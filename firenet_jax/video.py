@@ -5,6 +5,7 @@ and renames it in `finish`; `write_video` does all of it.
 """
 
 import contextlib
+import itertools
 import os
 import re
 import shutil
@@ -17,7 +18,7 @@ import av
 import numpy as np
 from PIL import Image
 
-from firenet_jax.files import OutputError, partial_name, writing
+from firenet_jax.files import OutputError, alone, partial_name, writing
 
 VIDEOS = (".mp4", ".gif")
 # What is no folder's name: a dot alone, as in out_0.35, does not make a file of it.
@@ -69,7 +70,7 @@ def check_output(path: Path, overwrite: bool) -> None:
     occupied = path.is_file() or (path.is_dir() and any(path.iterdir()))
     if occupied and not overwrite:
         raise OutputError(f"{path} exists: choose another output or pass --overwrite")
-    if path.is_dir() and path.is_mount():
+    if path.is_dir() and os.path.ismount(path):
         raise OutputError(f"{path} is a disk of its own: choose a folder in it")
     if path.is_dir() and Path.cwd().is_relative_to(path.resolve()):
         raise OutputError(f"{path} is the folder that you are in: choose a folder in it")
@@ -114,10 +115,11 @@ class FolderWriter:
         self.count = done
         with writing(path):
             self.partial.mkdir(exist_ok=True)
-            stamps = self.partial / "timestamps.txt"
-            kept = stamps.read_text().splitlines()[:done] if done else []
-            stamps.write_text("".join(f"{line}\n" for line in kept))
-            self.stamps = stamps.open("a")
+            self.stamps = (self.partial / "timestamps.txt").open("a+", newline="")
+            alone(self.stamps, path)
+            self.stamps.seek(0)
+            kept = itertools.islice(self.stamps, done)
+            self.stamps.truncate(sum(map(len, kept)))
 
     def write(self, picture: np.ndarray, time: int) -> None:
         name = self.partial / f"frame_{self.count:010d}.png"
@@ -159,6 +161,8 @@ class VideoWriter:
         self.rate = Fraction(fps).limit_denominator(1000)
         self.count = 0
         with writing(path):
+            self.held = self.partial.open("ab")
+            alone(self.held, path)
             self.container = av.open(str(self.partial), "w")
         self.stream = self.filter = None
 
@@ -197,12 +201,14 @@ class VideoWriter:
             if self.stream is not None:
                 self.container.mux(self.stream.encode(None))
             self.container.close()
+            self.held.close()
             self.partial.replace(self.path)
 
     def abandon(self) -> None:
         """Removes the partial file: a video cannot be continued."""
         with contextlib.suppress(OSError):
             self.container.close()
+        self.held.close()
         self.partial.unlink(missing_ok=True)
 
 
@@ -235,14 +241,24 @@ def open_writer(path: Path, fps: float, done: int = 0) -> FolderWriter | VideoWr
 def write_video(path: str | Path, pictures: Iterable[np.ndarray], fps: float = 30) -> None:
     """Pictures (H, W) or (H, W, 3) uint8 -> .mp4, .gif, or a folder of png; replaces what is there.
 
-    Raises OutputError for another suffix or a name that cannot be written.
+    Raises OutputError for another suffix or a name that cannot be written, ValueError for no
+    pictures, and for one of another kind or of another size than the first.
     """
     path = followed(Path(path))
     check_output(path, overwrite=True)
-    writer = open_writer(path, fps)
+    writer, shape = open_writer(path, fps), None
     try:
-        for number, picture in enumerate(pictures):
-            writer.write(np.asarray(picture), round(number * 1e6 / fps))
+        for number, picture in enumerate(map(np.asarray, pictures)):
+            shape = shape or picture.shape
+            kind = picture.ndim == 2 or picture.shape[2:] == (3,)
+            if not (kind and picture.dtype == np.uint8 and picture.shape == shape):
+                raise ValueError(
+                    f"picture {number + 1} is {picture.dtype} of the shape {picture.shape}, "
+                    "expected uint8 (H, W) or (H, W, 3), all of one size"
+                )
+            writer.write(picture, round(number * 1e6 / fps))
+        if shape is None:
+            raise ValueError(f"{path}: there are no pictures to write")
         writer.finish()
     except BaseException:
         writer.abandon()

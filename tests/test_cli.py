@@ -195,6 +195,15 @@ def test_outputs_that_cannot_be_written(here, capsys):
     assert (here / "file").read_text() == "mine"
 
 
+def test_other_systems_have_no_glibc(monkeypatch):
+    def windows(name):
+        raise TypeError("argument of type 'NoneType' is not iterable")
+
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(cli.ctypes, "CDLL", windows)
+    cli._return_freed_memory()
+
+
 @pytest.mark.parametrize("output", ["out", "out.mp4", "out.gif"])
 def test_no_room_while_writing(here, output):
     """A limit on the size of files stands for a full disk; in a process of its own."""

@@ -3,6 +3,7 @@ import json
 import subprocess
 import sys
 import textwrap
+import threading
 
 import jax
 import numpy as np
@@ -377,6 +378,20 @@ def test_names_with_dots(tmp_path, weights):
     packed.write_bytes(gzip.compress(paths[0].read_bytes()))
     run(settings(weights, (*paths, packed), tmp_path / "out"))
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"run.1", "run.2", "b"}
+
+
+def test_nothing_runs_on_after_an_error_that_is_kept(tmp_path, weights, monkeypatch):
+    """As a notebook keeps the last one, and with it all that was going on."""
+    recording = write_recording(tmp_path / "a.txt", 30_000)
+
+    def full(self, picture, time):
+        raise OSError("no room")
+
+    monkeypatch.setattr(FolderWriter, "write", full)
+    before = set(threading.enumerate())
+    with pytest.raises(OSError, match="no room") as kept:
+        run(settings(weights, (recording,), tmp_path / "out"))
+    assert kept.tb and not {t for t in set(threading.enumerate()) - before if t.name != "pack_0"}
 
 
 def test_no_events_is_an_error(tmp_path, weights):

@@ -279,6 +279,12 @@ def test_damaged_objects(file, layout, tree, message):
         read_state_dict(file(layout(tree, SMALL)))
 
 
+def test_sizes_of_thousands_of_dimensions(file, layout):
+    tree = whole(b"ctorch\nSize\n(" + b"]" + b"(" + b"K\x01" * 65 + b"e" + b"tR")
+    with pytest.raises(CheckpointError, match="damaged"):
+        read_state_dict(file(layout(tree, SMALL)))
+
+
 def test_key_that_takes_for_ever_to_hash(file, layout):
     tree = whole(b"}", b")" + b"2\x86" * 60, number(1), b"s")  # t = (t, t), 60 times
     tree = tree.replace(b"2\x86", b"q\x01h\x01\x86")

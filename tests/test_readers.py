@@ -20,7 +20,7 @@ from PIL import Image
 
 from firenet_jax import readers
 from firenet_jax.events import Events, RecordingError, concatenate
-from firenet_jax.readers import dat, evt3, hdf5, ncaltech, open_recording, rosbag, text
+from firenet_jax.readers import dat, ecd, evt3, hdf5, ncaltech, open_recording, rosbag, text
 
 T = np.array([1000, 1500, 1500, 20_000, 3_000_007])  # microseconds
 X = np.array([0, 5, 319, 7, 2])
@@ -427,6 +427,22 @@ def test_wrong_ecd(tmp_path):
         refused(folder, "images.txt, line 2")
 
 
+@pytest.mark.parametrize("name", ["/dev/zero", "../secret.png", "images/../../a.png"])
+def test_ecd_names_no_pictures_elsewhere(tmp_path, name):
+    folder = ecd_folder(tmp_path / "recording")
+    write(folder / "images.txt", f"0.0 images/a.png\n0.1 {name}\n")
+    refused(folder, f"images.txt, line 2: '{name}' lies elsewhere")
+
+
+def test_ecd_of_enormous_parts(tmp_path, monkeypatch):
+    folder = ecd_folder(tmp_path)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 5)
+    with pytest.raises(RecordingError, match="a.png: cannot be read .*bomb"):
+        open_recording(folder, (3, 4)).frames.read(0)
+    monkeypatch.setattr(ecd, "MOST", 30)
+    refused(folder, "images.txt: is larger than")
+
+
 # ---------------------------------------------------------------- HDF5
 
 
@@ -564,6 +580,22 @@ def test_cnn_with_a_strange_sensor_size(tmp_path, size):
 @pytest.mark.parametrize("size", [[-24, 32], [0, 0], [100_000, 100_000]])
 def test_cnn_with_a_sensor_that_cannot_be(tmp_path, size):
     refused(write_cnn(tmp_path / "a.h5", size=size), "states a sensor of", size=None)
+
+
+@pytest.mark.parametrize("name", ["events/xs", "images/image000000001"])
+def test_hdf5_does_not_read_other_files(tmp_path, name):
+    write(tmp_path / "secret", bytes(1000))
+    path = write_cnn(tmp_path / "a.h5")
+    with h5py.File(path, "a") as file:
+        old = file[name]
+        about = {"shape": old.shape, "dtype": old.dtype}
+        stamp = old.attrs.get("timestamp", 0.0)
+        del file[name]
+        outside = [(str(tmp_path / "secret"), 0, h5py.h5f.UNLIMITED)]
+        file.create_dataset(name, external=outside, **about).attrs["timestamp"] = stamp
+    with pytest.raises(RecordingError, match=f"{name} is stored in other files"):
+        recording = open_recording(path)
+        recording.frames.read(1)
 
 
 def test_hdf5_with_names_that_are_no_text(tmp_path):

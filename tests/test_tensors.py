@@ -1,3 +1,7 @@
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -128,6 +132,18 @@ def test_capacities_only_grow_and_are_few():
     assert capacity(CAPACITIES[-1] + 1) == 2 * CAPACITIES[-1]
     with pytest.raises(ValueError, match="do not fit"):
         pack([[random_events(np.random.default_rng(0), 10)]], size=9)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks")
+def test_packs_in_a_forked_process_too():
+    """As workers of a data loader do: threads of the parent are not in them."""
+    script = (
+        "import os; import numpy as np; from firenet_jax.events import Events; "
+        "from firenet_jax.tensors import pack; zeros = np.zeros(200_000, int); "
+        "rows = [[Events.of(zeros, zeros, zeros, zeros)]]; pack(rows); child = os.fork(); "
+        "child or (pack(rows), os._exit(0)); os._exit(os.waitpid(child, 0)[1])"
+    )
+    subprocess.run([sys.executable, "-W", "ignore", "-c", script], check=True, timeout=60)
 
 
 def test_other_counts_do_not_recompile():

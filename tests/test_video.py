@@ -1,3 +1,5 @@
+import os
+import sys
 from pathlib import Path
 
 import av
@@ -6,7 +8,7 @@ import pytest
 from PIL import Image
 
 from firenet_jax.files import OutputError
-from firenet_jax.video import FolderWriter, VideoWriter, check_output, write_video
+from firenet_jax.video import FolderWriter, VideoWriter, check_output, open_writer, write_video
 
 
 def ramp(count=6, height=30, width=41):
@@ -45,6 +47,39 @@ def test_folder_goes_on_where_it_stopped(tmp_path):
     assert len(list((tmp_path / "out").glob("*.png"))) == 4
     stamps = (tmp_path / "out" / "timestamps.txt").read_text().split()
     assert stamps == [f"0.00000{k}" for k in range(4)]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
+@pytest.mark.parametrize("name", ["out", "out.mp4"])
+def test_two_runs_do_not_write_the_same_output(tmp_path, name):
+    first = open_writer(tmp_path / name, 30)
+    first.write(ramp()[0], 0)
+    with pytest.raises(OutputError, match=f"{name}: another run is writing it"):
+        open_writer(tmp_path / name, 30)
+    first.write(ramp()[1], 1)
+    first.finish()
+    if name == "out":
+        assert (tmp_path / name / "timestamps.txt").read_text() == "0.000000\n0.000001\n"
+    else:
+        assert len(decoded(tmp_path / name)) == 2
+    open_writer(tmp_path / name, 30).abandon()  # nobody holds it now
+
+
+@pytest.mark.parametrize("name", ["out", "out.mp4", "out.gif"])
+@pytest.mark.parametrize(
+    "pictures, said",
+    [
+        ([], "no pictures"),
+        ([np.zeros((8, 8), np.float32)], "picture 1 is float32"),
+        ([np.zeros((8, 8), bool)], "picture 1 is bool"),
+        ([np.zeros((8, 8, 4), np.uint8)], "picture 1 is uint8 of the shape .8, 8, 4"),
+        ([np.zeros((8, 8), np.uint8), np.zeros((8, 9), np.uint8)], "picture 2 is"),
+    ],
+)
+def test_pictures_that_cannot_be_written(tmp_path, name, pictures, said):
+    with pytest.raises(ValueError, match=said):
+        write_video(tmp_path / name, pictures)
+    assert not (tmp_path / name).exists()
 
 
 def test_a_finished_folder_is_replaced_whole(tmp_path):
@@ -124,7 +159,7 @@ def test_a_dot_makes_no_file_of_a_folder(tmp_path):
 
 def test_a_mounted_disk_is_no_output(tmp_path, monkeypatch):
     (tmp_path / "disk").mkdir()
-    monkeypatch.setattr(Path, "is_mount", lambda path: path.name == "disk")
+    monkeypatch.setattr(os.path, "ismount", lambda path: Path(path).name == "disk")
     with pytest.raises(OutputError, match="choose a folder in it"):
         check_output(tmp_path / "disk", overwrite=False)
 

@@ -146,6 +146,14 @@ def microseconds(seconds: np.ndarray) -> np.ndarray:
     return np.rint(np.asarray(seconds, np.float64) * 1e6).astype(np.int64)
 
 
+def frame_times(path: Path, times: np.ndarray) -> np.ndarray:
+    """Microseconds where integer, seconds where floating -> (F,) int64 microseconds."""
+    if not np.isfinite(times).all():
+        frame = int(np.argmin(np.isfinite(times)))
+        raise RecordingError(f"{path}, frame {frame + 1}: its time is {times[frame]}")
+    return times.astype(np.int64) if times.dtype.kind in "iu" else microseconds(times)
+
+
 def to_events(
     path: Path, row: int, t, x, y, p, place: Callable[[int], str] = event_number
 ) -> Events:

@@ -11,13 +11,15 @@ The files name no sensor size: it is that of the first frame, and unknown where 
 import io
 import math
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 from PIL import Image
 
 from firenet_jax.events import Frames, RecordingError, logger
 from firenet_jax.readers import Source, microseconds, reading, text, to_frame
+
+MOST = 1 << 26  # bytes of images.txt, and of a picture
 
 
 def matches(path: Path) -> bool:
@@ -54,10 +56,13 @@ def _folder_in(path: Path) -> str | None:
 
 
 def _bytes(path: Path, name: str) -> bytes:
-    if path.is_dir():
-        return (path / name).read_bytes()
-    with text.opened(path, _folder_in(path) + name) as stream:
-        return stream.read()
+    """Of a list or a picture: neither is so large that it would have to be read in parts."""
+    inside = open(path / name, "rb") if path.is_dir() else None
+    with inside or text.opened(path, _folder_in(path) + name) as stream:
+        content = stream.read(MOST + 1)
+    if len(content) > MOST:
+        raise RecordingError(f"{path}, {name}: is larger than {MOST >> 20} MB: it is damaged")
+    return content
 
 
 def _frames(path: Path) -> Frames | None:
@@ -79,6 +84,8 @@ def _frames(path: Path) -> Frames | None:
                 f"{path}, images.txt, line {number}: {line.strip()!r} where a time in seconds "
                 "and the name of a picture are expected"
             )
+        if PurePath(name).is_absolute() or ".." in PurePath(name).parts:
+            raise RecordingError(f"{path}, images.txt, line {number}: {name!r} lies elsewhere")
         names.append(name)
     if not names:
         return None
@@ -92,6 +99,7 @@ def _frames(path: Path) -> Frames | None:
 
 def _frame(path: Path, name: str) -> np.ndarray:
     # KeyError: not in the zip; OSError: not in the folder, or not a picture
-    with reading(path / name, OSError, KeyError, SyntaxError):
+    bomb = Image.DecompressionBombError
+    with reading(path / name, OSError, KeyError, SyntaxError, bomb):
         with Image.open(io.BytesIO(_bytes(path, name))) as picture:
             return to_frame(np.asarray(picture.convert("L")), path)

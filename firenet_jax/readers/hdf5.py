@@ -18,7 +18,15 @@ import h5py
 import numpy as np
 
 from firenet_jax.events import Events, Frames, RecordingError
-from firenet_jax.readers import Source, extra, in_chunks, microseconds, reading, to_events, to_frame
+from firenet_jax.readers import (
+    Source,
+    extra,
+    frame_times,
+    in_chunks,
+    reading,
+    to_events,
+    to_frame,
+)
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 COLUMNS = {"event_cnn_minimal": ("ts", "xs", "ys", "ps"), "DSEC": ("t", "x", "y", "p")}
@@ -77,7 +85,7 @@ def _reader(path: Path, file: h5py.File, layout: str) -> tuple[Callable[[slice],
     """(rows -> Events, number of rows)"""
     if layout == "MVSEC":
         events = file[f"{MVSEC}/events"]
-        _check_filters(path, events)
+        _check_stored(path, events)
         if events.ndim != 2 or events.shape[1] != 4:
             raise RecordingError(
                 f"{path}: {MVSEC}/events has the shape {events.shape}, expected (N, 4)"
@@ -91,7 +99,7 @@ def _reader(path: Path, file: h5py.File, layout: str) -> tuple[Callable[[slice],
 
     columns = [file["events"][name] for name in COLUMNS[layout]]
     for column in columns:
-        _check_filters(path, column)
+        _check_stored(path, column)
     if len({column.shape for column in columns}) != 1 or columns[0].ndim != 1:
         found = ", ".join(f"{column.name} {column.shape}" for column in columns)
         raise RecordingError(f"{path}: its columns differ in length: {found}")
@@ -106,8 +114,11 @@ def _reader(path: Path, file: h5py.File, layout: str) -> tuple[Callable[[slice],
     return read, len(columns[0])
 
 
-def _check_filters(path: Path, data: h5py.Dataset):
-    """Compression that h5py lacks comes with hdf5plugin, which adds it when imported."""
+def _check_stored(path: Path, data: h5py.Dataset):
+    """Data of other files is not read: a stranger would choose which. Compression that h5py lacks
+    comes with hdf5plugin, which adds it when imported."""
+    if data.external:
+        raise RecordingError(f"{path}: {data.name} is stored in other files: ask for one with all")
     created = data.id.get_create_plist()
     for number in (created.get_filter(i)[0] for i in range(created.get_nfilters())):
         if not h5py.h5z.filter_avail(number):
@@ -124,21 +135,15 @@ def _frames(path: Path, file: h5py.File, layout: str) -> Frames | None:
         if f"{MVSEC}/image_raw" not in file:
             return None
         times = file[f"{MVSEC}/image_raw_ts"][:]
-        return Frames(_times(path, times), lambda i: _frame(path, f"{MVSEC}/image_raw", i))
+        return Frames(frame_times(path, times), lambda i: _frame(path, f"{MVSEC}/image_raw", i))
     if layout == "DSEC" or not len(file.get("images", ())):
         return None
     names = sorted(file["images"])
     times = np.array([file["images"][name].attrs["timestamp"] for name in names])
-    return Frames(_times(path, times), lambda i: _frame(path, f"images/{names[i]}", ...))
-
-
-def _times(path: Path, times: np.ndarray) -> np.ndarray:
-    if not np.isfinite(times).all():
-        frame = int(np.argmin(np.isfinite(times)))
-        raise RecordingError(f"{path}, frame {frame + 1}: its time is {times[frame]}")
-    return times.astype(np.int64) if times.dtype.kind in "iu" else microseconds(times)
+    return Frames(frame_times(path, times), lambda i: _frame(path, f"images/{names[i]}", ...))
 
 
 def _frame(path: Path, name: str, index) -> np.ndarray:
     with opened(path) as file:
+        _check_stored(path, file[name])
         return to_frame(file[name][index], path)

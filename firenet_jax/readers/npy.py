@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from firenet_jax.events import Events, Frames, RecordingError
-from firenet_jax.readers import Source, in_chunks, microseconds, reading, to_events, to_frame
+from firenet_jax.readers import Source, frame_times, in_chunks, reading, to_events, to_frame
 
 # layout: files of times, coordinates, polarities, frame times
 FILES = {
@@ -83,10 +83,7 @@ def _frames(path: Path, layout: str) -> Frames | None:
     count = len(images)
     if len(times) != count:
         raise RecordingError(f"{path}: has {count} frames in images.npy, but {len(times)} times")
-    if not np.isfinite(times).all():
-        frame = int(np.argmin(np.isfinite(times)))
-        raise RecordingError(f"{files[1]}, frame {frame + 1}: its time is {times[frame]}")
-    times = times.astype(np.int64) if times.dtype.kind in "iu" else microseconds(times)
+    times = frame_times(files[1], times)
     return Frames(times, lambda i: to_frame(_mapped(files[0])[i], files[0])) if count else None
 
 
