@@ -44,11 +44,11 @@ class Events:
 
     @classmethod
     def of(cls, t, x, y, p) -> "Events":
-        """Columns of any integer dtype -> Events with the dtypes above; p: bool, 0 and 1, or -1
-        and 1. Raises ValueError for times that are no whole microseconds."""
+        """Columns of whole numbers -> Events with the dtypes above; p: bool, 0 and 1, or -1 and 1.
+        Raises ValueError for times that are no whole microseconds."""
         t, p = np.asarray(t), np.asarray(p)
-        if t.size and t.dtype.kind not in "iu":
-            raise ValueError(f"times are {t.dtype}, expected whole microseconds: 1e6 times seconds")
+        if t.dtype.kind == "f" and (t != np.rint(t)).any():
+            raise ValueError("times must be whole microseconds: round 1e6 times seconds")
         return cls(
             t.astype(np.int64, copy=False),
             np.asarray(x, np.int16),

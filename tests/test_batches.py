@@ -379,3 +379,20 @@ def test_short_files_are_left_out_with_a_warning(tmp_path, noise, caplog):
 def test_settings_that_cannot_be_are_said(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))} is"):
         Augment(**wrong)
+
+
+def test_crops_and_windows_reach_to_the_end(noise):
+    assert take(noise, 1, crop=HEIGHT)[0].images.shape[2:] == (HEIGHT, HEIGHT)
+    first = {
+        int(places(data.images[:, b])[1][0])
+        for data in take(noise, 4, windows=IMAGES - 2, augment=NOTHING)
+        for b in range(BATCH)
+    }
+    assert first == {1, 2}
+
+
+def test_long_files_have_as_many_turns_as_they_have_windows_for(tmp_path, noise):
+    pictures = itertools.islice(noise_pictures(1), WINDOWS + 1)
+    short = write(tmp_path / "short.h5", random_events(1), pictures)
+    for data in take([noise[0], short], 2, batch=4, augment=NOTHING):  # 12 and 4 windows
+        assert sorted(places(data.images[:, b])[0] for b in range(4)) == [0, 0, 0, 1]

@@ -219,3 +219,10 @@ def test_no_room_while_writing(here, output):
     said = [line for line in done.stderr.splitlines() if "error" in line]
     assert len(said) == 1 and output in said[0] and "Traceback" not in done.stderr, done.stderr
     assert not (here / output).exists()
+
+
+def test_info_names_hot_pixels_by_column_and_row(here, capsys):
+    rows = [f"{k / 1e4:.4f} {k % 24} {k // 24 % 20} 1" for k in range(480)]
+    text_with(here / "hot.txt", [*rows, *["0.5 17 4 1"] * 400])
+    assert json.loads(firenet(capsys, "info hot.txt --json")[1])["hot_pixels"] == [[17, 4]]
+    assert "1 (x,y: 17,4)" in firenet(capsys, "info hot.txt")[1]

@@ -112,6 +112,7 @@ def test_what_is_written_is_read_back(tmp_path, monkeypatch, pieces):
 def test_the_layout_is_that_of_event_cnn_minimal(tmp_path):
     """Read as a program would that knows only the layout (SEMANTICS 7)."""
     events, pictures = random_events(500), random_pictures([0, 300_000, 600_000])
+    events.t[events.t.searchsorted(300_000) :][:3] = 300_000  # at the time of a picture
     path = tmp_path / "a.h5"
     write_sequence(path, [events], pictures, height=HEIGHT, width=WIDTH, source="esim")
     with h5py.File(path) as file:
@@ -434,3 +435,33 @@ def test_number_of_pictures_follows_the_duration(tmp_path):
     )
     times = [picture.time for picture in pictures]
     assert len(times) == math.floor(0.25 * 30) + 1 and times[:2] == [0, 33_333]
+
+
+def test_training_and_validation_choose_from_other_textures(tmp_path, monkeypatch):
+    """And after as many sequences as share them, from others again."""
+    chosen, made = set(), load_textures(count=2, size=16, procedural=1.0)
+
+    def drawn(*args):
+        chosen.add(args[-1])  # the seed
+        return made
+
+    monkeypatch.setattr(dataset, "POOL", 2)
+    monkeypatch.setattr(dataset, "load_textures", drawn)
+    monkeypatch.setattr(dataset, "write_sequence", lambda path, *_, **__: path.touch() or 0)
+    monkeypatch.setattr(dataset, "sequence", lambda key, textures, *_: ((), ()))
+    run(settings(tmp_path / "set", sequences=6, validation=2))
+    assert len(chosen) == 3  # two of training, one of validation
+
+
+def test_times_of_a_clip_count_from_its_first_picture(tmp_path):
+    clip = tmp_path / "cut.mkv"
+    with av.open(str(clip), "w") as container:
+        stream = container.add_stream("ffv1", rate=50)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "gray"
+        for number in (10, 11, 13):
+            picture = np.full((HEIGHT, WIDTH), 100, np.uint8)
+            frame = av.VideoFrame.from_ndarray(picture, format="gray")
+            frame.pts = number
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    assert [picture.time for picture in read_clip(clip)] == [0, 20_000, 60_000]

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
-from firenet_jax import cli, evaluate, methods, metrics
+from firenet_jax import cli, comparison, evaluate, methods, metrics
 from firenet_jax.baselines import e2vid
 from firenet_jax.checkpoint import save_weights
 from firenet_jax.comparison import COMPARED, Gap, matched
 from firenet_jax.dataset import Picture, write_sequence
-from firenet_jax.evaluate import Evaluate, interval, plan, run
+from firenet_jax.evaluate import Evaluate, interval, plan, read_flow, run
 from firenet_jax.events import Events
 from firenet_jax.files import OutputError
 from firenet_jax.methods import Missing, load, recurrent_unet
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pytorch_file import CheckpointError
 from firenet_jax.readers import open_recording
-from firenet_jax.report import METRICS, notes, steps
+from firenet_jax.report import METRICS, _best, notes, steps
 from firenet_jax.tensors import normalise, pack, voxelise
 from firenet_jax.windows import Window
 
@@ -237,6 +237,7 @@ def test_damaged_pictures_of_an_earlier_run_are_named(folder, tmp_path):
         run(ours)
     path.unlink()
     run(ours)
+    assert path.is_file()  # computed again
 
 
 def test_other_settings_are_refused_by_name_and_replaced_when_told(folder, tmp_path):
@@ -281,6 +282,7 @@ def test_intervals_of_the_event_camera_dataset(tmp_path):
     # a window before the first frame that counts is always there, else the warm-up's share
     assert counted(warm_up=0.0) == pytest.approx((1.0, 2.5, 0.9))
     assert counted(warm_up=0.35) == pytest.approx((1.0, 2.5, 0.6))
+    assert counted(warm_up=0.5) == pytest.approx((1.0, 2.5, 0.5))  # at a frame
     assert counted(start=1.0, stop=1.05, warm_up=0.2)[:2] == pytest.approx((1.0, 1.0))
     with pytest.raises(Gap, match="no frames from 7 to 8 s"):
         counted(start=7.0, stop=8.0)
@@ -498,3 +500,45 @@ def test_ticks_are_few_round_and_enclose(low, high, expected):
 def test_metrics_are_known_by_name():
     assert set(COMPARED) | {"lpips", "temporal_error"} == set(METRICS)
     assert all(callable(getattr(metrics, name)) for name in COMPARED)
+
+
+def test_predictions_a_little_late_count_and_flow_needs_the_frame_before(folder, tmp_path):
+    """Windows of one event, half a millisecond after frames 1, 2, 4 and the last, 5."""
+    t = PERIOD * np.array([1, 2, 4, 5]) + 500
+    path = write(tmp_path / "a.h5", 6, Events.of(t, [3, 4, 5, 6], [3] * 4, [1] * 4))
+    choices = {"data": (path,), "methods": "hf", "events": 1}
+    entry = run(settings(folder, tmp_path / "out", **choices))["sequences"]["a"]["methods"]["hf"]
+    assert entry["frame_numbers"] == [1, 2, 4, 5] and entry["of"] == 5
+    known = [value is not None for value in entry["values"]["temporal_error"]]
+    assert known == [False, True, False, True]
+
+
+def test_flow_is_not_known_where_frames_were_left_out(tmp_path):
+    path = write(tmp_path / "a.h5", 9)
+    found = plan("a", open_recording(path), Evaluate((path,), tmp_path, keep_ratio=0.7, seed=1))
+    gaps = np.diff(found.numbers)
+    assert {1, 2} <= set(gaps.tolist())
+    for place, gap in enumerate(gaps, 1):
+        assert (read_flow(found, place) is None) == (gap > 1)
+
+
+def test_temporal_errors_do_not_depend_on_where_batches_end(folder, tmp_path, monkeypatch):
+    path, values = write(tmp_path / "a.h5", 8), []
+    for batch in (8, 3):
+        for module in (evaluate, comparison):
+            monkeypatch.setattr(module, "BATCH", batch)
+        choices = {"data": (path,), "methods": "hf"}
+        results = run(settings(folder, tmp_path / f"{batch}", **choices))
+        values.append(results["sequences"]["a"]["methods"]["hf"]["values"]["temporal_error"])
+    assert values[0][0] is values[1][0] is None and len(values[0]) == 7
+    assert values[1][1:] == pytest.approx(values[0][1:], abs=1e-6)
+
+
+def test_the_best_is_the_least_distance_and_the_greatest_similarity():
+    entries = {
+        "a": {"means": {"mse": 0.02, "ssim": 0.9}, "gaps": {}},
+        "b": {"means": {"mse": 0.01, "ssim": 0.8}, "gaps": {}},
+        "c": {"gap": "no weights"},
+    }
+    assert _best(entries, "mse") == "0.0100" and _best(entries, "ssim") == "0.900"
+    assert _best({"a": entries["a"], "c": entries["c"]}, "mse") is None

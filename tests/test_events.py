@@ -13,6 +13,6 @@ def test_columns_of_any_kind(p, kind):
 
 
 def test_seconds_are_no_times():
-    with pytest.raises(ValueError, match="float64, expected whole microseconds"):
+    with pytest.raises(ValueError, match="whole microseconds: round 1e6 times seconds"):
         Events.of([0.25, 0.75], [0, 0], [0, 0], [0, 1])
     assert len(Events.of([], [], [], [])) == 0

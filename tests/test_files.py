@@ -1,5 +1,6 @@
 """Files: whole or not there; damaged ones refused by name."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -81,3 +82,31 @@ def test_other_content_is_another_identity(tmp_path):
     (folder / "out.partial").mkdir()
     (folder / "out.partial" / "frame.png").write_text("output")
     assert seen[0] != seen[1] != seen[2] == identity(folder)
+
+
+def test_killed_while_writing_the_old_arrays_stay(tmp_path, monkeypatch):
+    path = tmp_path / "a.npz"
+    write_arrays(path, x=np.arange(5))
+
+    def killed(file, **arrays):
+        Path(file).write_bytes(b"PK half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez_compressed", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_arrays(path, x=np.arange(9))
+    assert read_arrays(path)["x"].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_content_of_the_same_size_is_another_identity(tmp_path):
+    """In a folder too; a copy that keeps the time of the change is the same."""
+    (tmp_path / "folder").mkdir()
+    file = tmp_path / "folder" / "events.txt"
+    file.write_text("some")
+    for path in (file, tmp_path / "folder"):
+        os.utime(file, ns=(0, 1_000_000_000))
+        seen = identity(path)
+        os.utime(file, ns=(0, 1_000_000_001))
+        assert identity(path) != seen
+        os.utime(file, ns=(0, 1_000_000_000))
+        assert identity(path) == seen

@@ -72,3 +72,25 @@ def test_read_hot_pixels_names_the_bad_line(tmp_path, line):
         filters.read_hot_pixels(path, 4, 5)
     with pytest.raises(RecordingError, match="missing.txt"):
         filters.read_hot_pixels(tmp_path / "missing.txt", 4, 5)
+
+
+def test_hot_pixels_are_looked_for_in_the_first_events():
+    def chunks():
+        yield random_events(np.random.default_rng(0), 500, 6, 8)
+        raise AssertionError("read beyond what was asked for")
+
+    filters.find_hot_pixels(Recording("memory", "memory", 6, 8, chunks), most=500)
+
+
+def test_a_hot_pixel_is_ten_times_as_busy_as_its_neighbours_and_far_from_the_mean():
+    def is_hot(counts, count):
+        counts[10, 20] = count
+        return filters.hot_pixels_of(counts)[10, 20]
+
+    even = np.full((60, 80), 50)
+    assert is_hot(even, 500) and not is_hot(even, 499)
+    busy = np.where(np.arange(80) < 40, 1, 100) * np.ones((60, 1), int)  # 50 and 50 around it
+    assert is_hot(busy, 400) and not is_hot(busy, 300)  # six deviations: 350
+    quiet = np.zeros((60, 80), int)
+    quiet[30, :] = 1
+    assert is_hot(quiet, 10) and not is_hot(quiet, 9)

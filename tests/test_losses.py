@@ -181,3 +181,13 @@ def test_jitted_equals_eager_and_does_not_recompile():
     programs = compiled._cache_size()
     compiled(arguments[0] + 1, *arguments[1:])
     assert compiled._cache_size() == programs
+
+
+def test_whether_the_state_is_warm_may_be_known_only_as_the_program_runs():
+    arguments, settings = sequence(), replace(NOTHING, l1=0.3, lambda_tc=1.5, l0=2, L=4)
+    compiled = jax.jit(lambda warm: sequence_loss(*arguments, settings, warm))
+    for warm, l0 in ((False, 2), (True, 0)):
+        expected, terms = sequence_loss(*arguments, replace(settings, l0=l0))
+        for loss, found in (compiled(warm), sequence_loss(*arguments, settings, warm)):
+            np.testing.assert_allclose(loss, expected, rtol=1e-5)
+            np.testing.assert_allclose(found["temporal"], terms["temporal"], rtol=1e-5)

@@ -52,3 +52,20 @@ def test_leaving_early_ends_the_thread_and_closes_the_source():
     next(stream)
     stream.close()
     assert closed.wait(5) and threading.active_count() == before
+
+
+def test_leaving_early_waits_until_the_source_is_closed():
+    closed = []
+
+    def items():
+        try:
+            while True:
+                yield 0
+        finally:
+            time.sleep(0.3)
+            closed.append(True)
+
+    stream = ahead(items())
+    next(stream)
+    stream.close()
+    assert closed

@@ -1,9 +1,11 @@
 import gzip
 import json
+import os
 import subprocess
 import sys
 import textwrap
 import threading
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -12,12 +14,13 @@ from PIL import Image
 from processes import finish, start
 
 from firenet_jax import pipeline
-from firenet_jax.checkpoint import save_weights
+from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.events import RecordingError
 from firenet_jax.files import OutputError, read_arrays
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pictures import Display
-from firenet_jax.pipeline import Reconstruct, run
+from firenet_jax.pipeline import Reconstruct, describe, plan, run
+from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import Network
 from firenet_jax.video import FolderWriter
 from firenet_jax.windows import Windows
@@ -471,3 +474,59 @@ def test_nothing_recompiles_while_200_windows_of_200_sizes_stream(tmp_path, weig
     counted = {name: n for name, n in counts.items() if any(our in name for our in ours)}
     assert len(counted) >= 4, counts  # the listener sees our functions by name
     assert max(counted.values()) <= 3, counts
+
+
+def test_all_that_pictures_depend_on_is_what_a_run_goes_on_with(tmp_path, weights):
+    path = write_recording(tmp_path / "a.txt", 50)
+
+    def record(name="out", normalise=True, **choices):
+        network = Weights(load_weights(weights).params, normalise)
+        ours = settings(weights, (path,), tmp_path / name, **choices)
+        return describe(ours, open_recording(path), network)
+
+    for choice in (
+        {"windows": Windows(events=90)}, {"network": Network(recurrent=False)},
+        {"display": Display(auto_range=True)}, {"preview": True}, {"hot_pixels": "auto"},
+        {"flip": True}, {"start": 0.1}, {"stop": 0.5}, {"sensor_size": "30x30"},
+        {"normalise": False},
+    ):  # fmt: skip
+        assert record(**choice) != record(), choice
+    for choice in ({"chunk": 2}, {"batch": 3}, {"fps": 5.0}, {"overwrite": True}):
+        assert record(**choice) == record(), choice
+    assert record("a.mp4", fps=5.0) != record("a.mp4")
+
+
+def test_folders_keep_the_dots_in_their_names(tmp_path):
+    folders = tmp_path / "run.1", tmp_path / "run.2"
+    for folder in folders:
+        folder.mkdir()
+    assert plan(folders, tmp_path / "out") == [tmp_path / "out/run.1", tmp_path / "out/run.2"]
+
+
+def test_what_a_run_keeps_for_another_is_true_and_does_not_stay(tmp_path, weights, monkeypatch):
+    """Pictures and times that it says are done are on disk by then."""
+    monkeypatch.setattr(pipeline, "RESUME_EVERY", 0)
+    replace, published = os.replace, []
+
+    def seen(source, target):
+        if Path(target).name == "resume.npz":
+            lines = (Path(target).parent / "timestamps.txt").read_text().splitlines()
+            published.append((int(read_arrays(Path(source))["pictures"]), len(lines)))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", seen)
+    run(settings(weights, (write_recording(tmp_path / "a.txt", 1000),), tmp_path / "out"))
+    assert published == [(4, 4), (8, 8)]
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"timestamps.txt", *(f"frame_{n:010d}.png" for n in range(10))}
+
+
+def test_colours_of_a_recording_that_ends_beside_one_that_goes_on(tmp_path, weights):
+    """Windows that do not exist are those of its own channels."""
+    paths = [write_recording(tmp_path / f"r{n}.txt", n, seed=n) for n in (800, 600)]
+    choices = {"network": Network(color=True)}
+    run(settings(weights, tuple(paths), tmp_path / "all", batch=2, **choices))
+    for path in paths:
+        run(settings(weights, (path,), tmp_path / "alone" / path.stem, **choices))
+        together, alone = (pictures_of(tmp_path / n / path.stem)[0] for n in ("all", "alone"))
+        assert np.abs(together.astype(int) - alone).max() <= 3

@@ -12,6 +12,7 @@ import struct
 import sys
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -20,7 +21,17 @@ from PIL import Image
 
 from firenet_jax import readers
 from firenet_jax.events import Events, RecordingError, concatenate
-from firenet_jax.readers import dat, ecd, evt3, hdf5, ncaltech, open_recording, rosbag, text
+from firenet_jax.readers import (
+    camera,
+    dat,
+    ecd,
+    evt3,
+    hdf5,
+    ncaltech,
+    open_recording,
+    rosbag,
+    text,
+)
 
 T = np.array([1000, 1500, 1500, 20_000, 3_000_007])  # microseconds
 X = np.array([0, 5, 319, 7, 2])
@@ -137,7 +148,8 @@ def test_frames_of_other_kinds():
     path = Path("file")
     np.testing.assert_array_equal(readers.to_frame(FRAME[..., None], path), FRAME)
     np.testing.assert_array_equal(readers.to_frame(FRAME.astype(np.uint16) << 8, path), FRAME)
-    np.testing.assert_array_equal(readers.to_frame(np.stack([FRAME] * 3, -1), path), FRAME)
+    for colours in ([FRAME] * 3, [FRAME] * 3 + [FRAME * 0]):  # and how opaque
+        np.testing.assert_array_equal(readers.to_frame(np.stack(colours, -1), path), FRAME)
     with pytest.raises(RecordingError, match="float64 of shape"):
         readers.to_frame(FRAME / 255, path)
 
@@ -856,6 +868,16 @@ def test_es_and_aedat4(tmp_path):
     refused(path, "header is damaged")  # faery alone would end the process
 
 
+def test_frames_of_one_camera_are_not_mixed_with_those_of_another():
+    kinds = {0: "events", 1: "frame", 2: "frame"}
+    packets = [
+        (SimpleNamespace(id=track, data_type=kinds[track]), name)
+        for track, name in ((0, "events"), (1, "a"), (2, "other"), (1, "b"))
+    ]
+    faery = SimpleNamespace(aedat=SimpleNamespace(Decoder=lambda path: iter(packets)))
+    assert list(camera._pictures(faery, Path("a.aedat4"))) == ["a", "b"]
+
+
 # ---------------------------------------------------------------- ROS bags
 
 HEADER = {1: "Header", 2: "std_msgs/Header"}
@@ -1010,6 +1032,14 @@ def test_bag_of_mono_packets(new_bag, caplog):
     bag.close()
     check(path, t=T - T[0] + EPOCH, size=None)
     assert "/camera/events, /second/events hold events; reading /camera/events" in caplog.text
+
+
+def test_mono_packets_are_rounded_to_the_nearest_microsecond(new_bag):
+    path, bag = new_bag("a")
+    words = [x << 32 | nanoseconds for x, nanoseconds in enumerate((0, 1400, 2600))]
+    bag.packet(EPOCH, np.array(words, "<u8").tobytes(), "mono")
+    bag.close()
+    check(path, EPOCH + np.array([0, 1, 3]), [0, 1, 2], [0] * 3, [0] * 3, size=None)
 
 
 def test_colour_frames_of_bags(new_bag, caplog):

@@ -8,7 +8,7 @@ from test_tensors import random_events
 from firenet_jax.checkpoint import convert
 from firenet_jax.events import Events
 from firenet_jax.network import Weights, initial_params, initial_state
-from firenet_jax.pictures import Display
+from firenet_jax.pictures import Display, display, initial_display_state
 from firenet_jax.reconstruction import (
     Network,
     events_to_pictures,
@@ -16,7 +16,8 @@ from firenet_jax.reconstruction import (
     padding,
     reconstruct,
 )
-from firenet_jax.tensors import pack
+from firenet_jax.tensors import normalise as normalised
+from firenet_jax.tensors import pack, voxelise
 
 
 @pytest.mark.parametrize("chunk", [1, 3, 7])
@@ -150,3 +151,39 @@ def test_events_become_pictures_without_a_word_from_the_host():
     assert " while(" in program  # the scan; so the names below would be found too
     for talk in ("infeed", "outfeed", " send(", " recv(", "copy-start", "callback"):
         assert talk not in program
+
+
+def test_the_pictures_network_runs_as_it_is_told():
+    rng = np.random.default_rng(1)
+    windows = [[random_events(rng, 300, 20, 24)] for _ in range(3)]
+    weights = Weights(initial_params(jax.random.key(0)), True)
+
+    def pictures(windows, network):
+        session, valid = initial_session(1, 20, 24, network), np.ones((len(windows), 1), bool)
+        _, found = events_to_pictures(
+            weights, session, pack(windows), valid, height=20, width=24, network=network
+        )
+        return np.asarray(found, int)
+
+    plain, alone = pictures(windows, Network()), pictures(windows[2:], Network())
+    assert np.abs(pictures(windows, Network(recurrent=False))[2:] - alone).max() <= 1
+    assert np.abs(plain[2:] - alone).max() > 3
+    rough = np.abs(pictures(windows, Network(bfloat16=True)) - plain)
+    assert rough.any() and rough.mean() < 3
+
+
+def test_pictures_are_cut_out_of_the_reflected_ones():
+    """19x23 pixels become 32x32: 7 above and 6 below, 5 on the left and 4 on the right."""
+    weights = Weights(initial_params(jax.random.key(0)), True)
+    packed = pack([[random_events(np.random.default_rng(2), 300, 19, 23)]])
+    network, valid = Network(pad=16), np.ones((1, 1), bool)
+    session = initial_session(1, 19, 23, network)
+    _, found = events_to_pictures(
+        weights, session, packed, valid, height=19, width=23, network=network
+    )
+    tensors = np.asarray(normalised(voxelise(packed, height=19, width=23)))
+    padded = np.pad(tensors, ((0, 0), (0, 0), (7, 6), (5, 4), (0, 0)), "reflect")
+    raw = Weights(weights.params, normalise=False)
+    images = reconstruct(raw, initial_state(1, 32, 32), jnp.asarray(padded))[1]
+    expected = np.asarray(display(initial_display_state(1), images)[1])[..., 7:-6, 5:-4]
+    assert np.abs(np.asarray(found, int) - expected).max() <= 1

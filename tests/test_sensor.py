@@ -526,3 +526,11 @@ def test_the_published_weights_reconstruct_simulated_photographs(reference):
         )
         scores.append(score)
     assert np.mean(scores) >= 0.65, np.round(scores, 2)
+
+
+def test_no_threshold_is_below_a_hundredth():
+    """Where mismatch would make it so: a pixel of threshold 0 fires without end."""
+    settings = SensorSettings(mismatch=0.2)
+    sensor = random_sensor(jax.random.key(3), height=40, width=40, settings=settings)
+    for threshold in (sensor.on, sensor.off):
+        assert threshold.min() == np.float32(0.01)

@@ -1,6 +1,9 @@
 import os
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +11,17 @@ import numpy as np
 import pytest
 import references
 
+from firenet_jax import tensors
 from firenet_jax.events import Events
-from firenet_jax.tensors import CAPACITIES, capacity, normalise, pack, voxelise
+from firenet_jax.tensors import (
+    BLOCK,
+    CAPACITIES,
+    capacity,
+    normalise,
+    pack,
+    pack_for_devices,
+    voxelise,
+)
 
 
 def random_events(rng, count, height=12, width=17, start=10**15, span=50_000):
@@ -152,3 +164,40 @@ def test_other_counts_do_not_recompile():
     for count in (10, 100, 1000, 9999):
         tensor_of(random_events(rng, count))
     assert voxelise._cache_size() == 1
+
+
+def test_a_list_of_several_blocks_is_the_sum_of_its_parts():
+    """Each part fits into one block; of the whole, every block has events."""
+    events = random_events(np.random.default_rng(8), 3 * BLOCK)
+    bounds = np.array([[[events.t[0], events.t[-1]]]])
+    parts = [events.select(slice(k * BLOCK, (k + 1) * BLOCK)) for k in range(3)]
+    expected = sum(tensor_of(part, bounds=bounds) for part in parts)
+    np.testing.assert_allclose(tensor_of(events), expected, atol=0.05)
+    assert np.abs(expected).max() > 20
+
+
+def test_a_long_list_is_not_given_away_before_its_times_are_there(monkeypatch):
+    """Another thread copies them, here a slow one."""
+    pool, events = ThreadPoolExecutor(1), random_events(np.random.default_rng(9), 1000)
+
+    def submit(task):
+        return pool.submit(lambda: (time.sleep(0.2), task()))
+
+    monkeypatch.setattr(tensors, "_helper", lambda process: SimpleNamespace(submit=submit))
+    found = pack([[events]], BLOCK).t[:1000].copy()
+    np.testing.assert_array_equal(found, events.t.astype(np.int32))
+
+
+def test_lists_for_devices_hold_their_recordings():
+    """Four recordings on two devices; t_min and duration stay (T, B)."""
+    rng, size = np.random.default_rng(10), CAPACITIES[1]
+    rows = [[random_events(rng, n) for n in counts] for counts in [(5, 70, 3, 40), (1, 20, 30, 2)]]
+    both = pack_for_devices(rows, 2, at_least=size)
+    assert len(both.t) == 2 * size and both.t_min.shape == both.duration.shape == (2, 4)
+    for k in (0, 1):
+        alone = pack([row[2 * k :][:2] for row in rows], size)
+        used = alone.window < 4
+        for ours, theirs in zip(both[:5], alone[:5], strict=True):
+            np.testing.assert_array_equal(ours[k * size :][:size][used], theirs[used])
+        for ours, theirs in zip(both[5:], alone[5:], strict=True):
+            np.testing.assert_array_equal(ours[:, 2 * k :][:, :2], theirs)

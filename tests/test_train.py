@@ -1,3 +1,4 @@
+import itertools
 import json
 import signal
 from dataclasses import replace
@@ -6,6 +7,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from processes import finish, start, together
 
@@ -300,3 +302,53 @@ def test_trains_on_files_and_resumes(tmp_path, chain):
         state, terms = train_step(state, next(sources), settings)
         seen.append(float(terms["loss"]))
     assert seen == [loss for _, kind, loss in losses(tmp_path / "whole") if kind == "train"]
+
+
+@pytest.mark.parametrize("name", ["muon", "adam"])
+def test_large_gradients_are_scaled_down_and_those_that_are_not_finite_left_out(tmp_path, name):
+    update = train.optimiser(tiny(tmp_path, optimiser=name, clip=0.5, warmup=0))
+    params = {"kernel": jnp.ones((3, 3, 2, 4)), "bias": jnp.ones(4)}
+    before = update.init(params)
+    _, after = update.update(jax.tree.map(lambda p: 100 * p, params), before, params)
+    moments = [
+        leaf for path, leaf in jax.tree_util.tree_leaves_with_path(after)
+        if ".mu" in jax.tree_util.keystr(path)
+    ]  # fmt: skip
+    assert 0 < optax.tree.norm(moments) <= 0.5
+    broken = params | {"bias": jnp.full(4, jnp.nan)}
+    change, again = update.update(broken, after, params)
+    assert not optax.tree.norm(change)
+    jax.tree.map(np.testing.assert_array_equal, again.inner_state, after.inner_state)
+
+
+def test_textures_to_validate_on_are_cut_anew(tmp_path, monkeypatch):
+    cut = []
+
+    def load(images, count, size, seed, procedural):
+        cut.append((count, seed))
+        return np.zeros((count, 2, 2), np.float32)
+
+    monkeypatch.setattr(train, "load_textures", load)
+    train.sources_of(tiny(tmp_path), 0)
+    (_, training), (_, validation) = cut
+    assert training != validation
+
+
+def test_a_run_that_goes_on_keeps_weights_that_did_better_before(tmp_path, monkeypatch):
+    """Nothing is computed: each step adds one to the biases, each run validates to one loss."""
+    scores = {}
+
+    def step(state, source, settings):
+        params = jax.tree.map(lambda leaf: leaf + 1, state.params)
+        return state._replace(params=params, step=state.step + 1), {"loss": 0.0}
+
+    monkeypatch.setattr(train, "train_step", step)
+    monkeypatch.setattr(train, "validate", lambda *_: (scores, ()))
+    monkeypatch.setattr(train, "sources_of", lambda *_: (itertools.repeat(0), [lambda: 0]))
+    monkeypatch.setattr(Log, "show", lambda *_: None)
+    kept = []
+    for scores["loss"], stop in ((1.0, 3), (2.0, 5), (0.5, 6)):
+        run(tiny(tmp_path), stop=stop)
+        kept.append(load_weights(tmp_path).params["head"]["bias"][0])
+    assert kept == [3, 3, 6]
+    assert load_weights(tmp_path / "last.npz").params["head"]["bias"][0] == 6

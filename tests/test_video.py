@@ -233,3 +233,29 @@ def test_a_gif_has_a_greatest_rate(tmp_path):
     write_video(tmp_path / "quick.gif", ramp(), fps=100)
     with pytest.raises(OutputError, match="at most 100 pictures per second"):
         write_video(tmp_path / "quicker.gif", ramp(), fps=120)
+
+
+@pytest.mark.parametrize("fps", [29.97, 0.5])
+def test_a_rate_need_not_be_whole(tmp_path, fps):
+    write_video(tmp_path / "a.mp4", ramp(), fps=fps)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert float(container.streams.video[0].average_rate) == pytest.approx(fps, rel=1e-4)
+
+
+def test_pictures_without_events_have_the_times_of_their_rate(tmp_path):
+    write_video(tmp_path / "out", ramp(3), fps=25)
+    stamps = (tmp_path / "out" / "timestamps.txt").read_text().split()
+    assert stamps == ["0.000000", "0.040000", "0.080000"]
+
+
+def test_a_folder_that_may_not_be_written_to_is_said_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)  # root may always
+    with pytest.raises(OutputError, match="is not writable: choose another output"):
+        check_output(tmp_path / "out", overwrite=False)
+
+
+def test_a_link_to_itself_is_no_output(tmp_path):
+    (tmp_path / "out").symlink_to(tmp_path / "out")
+    with pytest.raises(OutputError, match="out: points to itself: choose another output"):
+        write_video(tmp_path / "out", ramp(1))
+    assert (tmp_path / "out").is_symlink()

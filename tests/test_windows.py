@@ -146,6 +146,7 @@ def test_no_events_no_windows():
         ({"duration": -1}, "more than 0"),
         ({"duration": float("nan")}, "more than 0"),
         ({"duration": 0.0001}, "whole microseconds"),
+        ({"duration": 5, "step": 0.0001}, "step is 0.0001 ms"),
         ({"events": 5, "step": 2.5}, "whole number"),
         ({"between_frames": True, "step": 2}, "fixed size"),
     ],
@@ -173,3 +174,11 @@ def test_windows_far_larger_than_chunks_cost_linear_time():
     recording = Recording("memory", "memory", 1000, 1000, lambda: iter(parts))
     for windows in (Windows(events=100_000), Windows(duration=1000)):
         assert [len(w.events) for w in cut(recording, windows)] == [100_000]
+
+
+def test_after_the_last_frame_the_clock_goes_on_as_it_mostly_did():
+    """One interval that is unlike the others, here the first, does not set the pace."""
+    recording = recording_of(range(0, 60, 5), frames=[0, 3, 13, 23, 33])
+    assert times_of(recording, between_frames=True) == [
+        [0], [5, 10], [15, 20], [25, 30], [35, 40], [45, 50], [55],
+    ]  # fmt: skip
