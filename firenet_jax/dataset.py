@@ -441,10 +441,10 @@ def simulate_clip(settings: Simulate) -> Path:
     except OSError as error:
         raise OutputError(f"{path.parent}: cannot make this folder ({error.strerror})") from error
     size = parse_size(settings.sensor_size)
-    first = list(itertools.islice(read_clip(clip, size), 2))
-    if len(first) < 2:
+    pictures = list(itertools.islice(read_clip(clip, size), 2))
+    if len(pictures) < 2:
         raise ValueError(f"{clip}: holds fewer than two pictures, so no change: name a video file")
-    height, width = first[0].image.shape
+    height, width = pictures[0].image.shape
     sensor = with_faults(settings.sensor) if settings.faults else settings.sensor
     camera = random_sensor(
         jax.random.key(settings.seed), height=height, width=width, settings=sensor

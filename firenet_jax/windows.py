@@ -52,7 +52,7 @@ class Windows:
         for name in ("events", "events_per_pixel", "duration", "step"):
             value = getattr(self, name)
             if value is not None and not 0 < value <= MOST:
-                raise ValueError(f"{name} is {value:g}, but must be more than 0, at most {MOST}")
+                raise ValueError(f"{name} is {value}, but must be more than 0, at most {MOST}")
         if self.step is not None:
             if self.between_frames:
                 raise ValueError("step overlaps windows of a fixed size, not those between frames")
