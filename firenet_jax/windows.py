@@ -8,6 +8,7 @@ import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -94,16 +95,14 @@ def cut(
                 f"{recording.path}: windows between frames need a recording with two frames or "
                 "more, each at a time of its own: use --events-per-pixel or --duration"
             )
-        return _by_time(
-            recording.path, chunks, begin, lambda first: _frame_spans(recording.path, times, first)
-        )
+        spans = partial(_frame_spans, recording.path, times)
+        return _by_time(recording.path, chunks, begin, spans)
     if windows.duration is not None:
         step = windows.duration if windows.step is None else windows.step
         if step > windows.duration:
             raise ValueError(f"step of {step} ms is longer than the window, {windows.duration} ms")
-        return _by_time(
-            recording.path, chunks, begin, lambda first: _grid_spans(windows.duration, step, first)
-        )
+        spans = partial(_grid_spans, windows.duration, step)
+        return _by_time(recording.path, chunks, begin, spans)
     count = windows.count(recording.pixels)
     step = count if windows.step is None else int(windows.step)
     if step > count:
