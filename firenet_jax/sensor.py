@@ -74,8 +74,9 @@ class SensorSettings:
     mismatch: float | None = None
     """Standard deviation of each pixel's own thresholds, in log intensity; about 0.03 in life."""
     noise: tuple[float, float] | None = None
-    """Shot noise: events per second and pixel, ON or OFF, at any time; at most one of a pixel
-    between two renderings."""
+    """Shot noise: events per second of a pixel in the dark that have no cause; in full light there
+    are a quarter as many. As they move the reference too, most are soon taken back by an event of
+    the other polarity. At most one of a pixel between two renderings."""
     leak: tuple[float, float] | None = None
     """ON events per second by which every pixel's reference drifts, about 0.1 in sensors."""
     hot: tuple[float, float] | None = None
@@ -260,10 +261,10 @@ def step(
     if sensor.drift is not None:
         rise = rise + seconds * sensor.drift  # seen from a reference that sinks, L rises
 
-    up = rise > 0
+    above = state.above + rise
+    up = above > 0
     polarity = jnp.where(up, 1.0, -1.0)
     threshold = jnp.where(up, sensor.on, sensor.off)
-    above = state.above + rise
     crossings = jnp.maximum(jnp.floor(polarity * above / threshold), 0.0)
     size = jnp.abs(rise)
     size = jnp.where(size > 0, size, 1.0)  # no rise, no crossing: anything finite will do
@@ -274,6 +275,10 @@ def step(
     first = jnp.clip(jnp.round(first * scale), 0.0, ticks.astype(jnp.float32)).astype(jnp.int32)
     spacing = jnp.minimum(threshold * scale, ticks.astype(jnp.float32)).astype(jnp.int32)
     count = crossings.astype(jnp.int32)
+    if sensor.noise is not None:
+        # Noise may have left the pixel beyond a threshold: it crosses that at once, so late that
+        # the crossings after it would not fit.
+        spacing = jnp.minimum(spacing, (ticks - first) // jnp.maximum(count - 1, 1))
     above = above - polarity * threshold * crossings
     run = Run(first, spacing, count, polarity)
     silent = None
@@ -283,7 +288,10 @@ def step(
     runs = (run,)
     if sensor.noise is not None:
         key = jax.random.fold_in(sensor.key, state.renderings)
-        runs += (_shot_noise(key, seconds * sensor.noise, image.shape, ticks),)
+        level = above / jnp.where(above > 0, sensor.on, sensor.off)
+        noise = _shot_noise(key, seconds * sensor.noise * (1 - 0.75 * image), level, ticks)
+        above = above - noise.count * jnp.where(noise.polarity > 0, sensor.on, -sensor.off)
+        runs += (noise,)
     return SensorState(after, above, silent, state.renderings + 1), runs
 
 
@@ -307,21 +315,27 @@ def _refractory(run: Run, silent: jax.Array, refractory: jax.Array, ticks: jax.A
     return Run(first, spacing, count, run.polarity), jnp.maximum(silent - ticks, 0)
 
 
-def _shot_noise(key: jax.Array, expected: jax.Array, shape, ticks: jax.Array) -> Run:
-    """At most one event a pixel and interval, at any time in it, ON or OFF alike.
+def _shot_noise(key: jax.Array, expected: jax.Array, level: jax.Array, ticks: jax.Array) -> Run:
+    """At most one event a pixel and interval, at any time in it.
 
-    Noise does not move the reference, nor does it wait for the refractory period. One random
-    number decides all: where it is below the probability, it is uniform below it.
+    expected: (H, W) events; level: (H, W) where the pixel is between its thresholds, OFF at -1 and
+    ON at 1. The nearer one is crossed the more easily: ON has the share (1 + level) / 2. The rate's
+    fall with light is that of Hu, Liu and Delbruck, "v2e", CVPRW 2021, and as there the reference
+    follows; but noise does not wait for the refractory period. One random number decides all: where
+    it is below the probability, it is uniform below it.
     """
     # Not that of at least one event of a Poisson process, 1 - exp(-expected): as no interval has
     # more than one, the rate that was asked for would be missed by a quarter at 0.6.
     chance = jnp.minimum(expected, 1.0)
-    number = jax.random.bits(key, shape, jnp.uint32).astype(jnp.float32) * 2.0**-32
+    number = jax.random.bits(key, level.shape, jnp.uint32).astype(jnp.float32) * 2.0**-32
     fires = number < chance
-    place = 2 * number / jnp.where(chance > 0, chance, 1.0)  # [0, 2): polarity and time
-    polarity = jnp.where(place < 1, 1.0, -1.0)
-    first = (ticks.astype(jnp.float32) * jnp.mod(place, 1.0)).astype(jnp.int32)
-    return Run(first, jnp.zeros(shape, jnp.int32), fires.astype(jnp.int32), polarity)
+    place = number / jnp.where(chance > 0, chance, 1.0)  # [0, 1): polarity and time
+    share = jnp.clip(0.5 + 0.5 * level, 0.0, 1.0)
+    on = place < share
+    part = jnp.where(on, place, place - share) / jnp.where(on, share, 1 - share)
+    first = (ticks.astype(jnp.float32) * jnp.where(fires, part, 0.0)).astype(jnp.int32)
+    polarity = jnp.where(on, 1.0, -1.0)
+    return Run(first, jnp.zeros_like(first), fires.astype(jnp.int32), polarity)
 
 
 def _stamps(first, spacing, number):

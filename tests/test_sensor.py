@@ -298,20 +298,60 @@ def test_leaks_are_on_events_at_their_rate_and_not_all_at_once():
     assert counts.max() < 1.6 * counts.mean()
 
 
-def test_shot_noise_has_its_rate_no_order_and_both_polarities():
-    events = listed(with_only(4, noise=(3.0, 3.0)), *still(10.0))
-    expected = 10 * 3 * H * W  # 5040, standard deviation 71
-    assert abs(len(events) - expected) < 300
-    assert abs(events.p.mean() - 0.5) < 0.03
-    spread = np.histogram(events.t % 10_000, 10, (0, 10_000))[0]  # within the intervals
-    assert abs(spread / len(events) - 0.1).max() < 0.02
-    per_pixel = np.bincount(events.y * W + events.x, minlength=H * W)
-    assert per_pixel.var() == pytest.approx(per_pixel.mean(), rel=0.4)  # Poisson
+def noise_alone(level, expected, count=20_000, seed=0):
+    """Draws of one pixel's noise: which fired, their polarities, and their places in [0, 1)."""
+    numbers = jnp.full((count,), expected), jnp.full((count,), level)
+    run = module._shot_noise(jax.random.key(seed), *numbers, jnp.int32(1000 * TICKS))
+    fired = np.asarray(run.count) > 0
+    return fired, np.asarray(run.polarity)[fired], np.asarray(run.first)[fired] / (1000 * TICKS)
 
 
-def test_shot_noise_keeps_its_rate_where_renderings_are_far_apart():
-    events = listed(with_only(4, noise=(60.0, 60.0)), *still(2.0))  # 0.6 events an interval
-    assert len(events) == pytest.approx(2 * 60 * H * W, rel=0.03)
+@pytest.mark.parametrize("expected", [0.03, 0.6])
+@pytest.mark.parametrize("level", [-1.0, -0.5, 0.0, 0.8, 1.0, 1.7])
+def test_shot_noise_has_its_rate_any_time_and_the_polarity_that_is_near(level, expected):
+    """0.6 events an interval: a Poisson process' chance of one or more would be 0.45."""
+    fired, polarity, place = noise_alone(level, expected)
+    assert abs(fired.mean() - expected) < 4 * np.sqrt(expected / len(fired))
+    assert abs((polarity > 0).mean() - min((1 + level) / 2, 1)) < 4 * 0.5 / np.sqrt(len(place))
+    for sign in (-1, 1):
+        here = place[polarity == sign]
+        if len(here):
+            assert here.min() >= 0 and here.max() < 1
+            spread = np.histogram(here, 5, (0, 1))[0] / len(here)
+            assert abs(spread - 0.2).max() < 4 * 0.4 / np.sqrt(len(here))
+
+
+def test_shot_noise_falls_with_light_to_a_quarter():
+    """Scenes at rest in the dark, in half light and in full light, 6 events per second in the dark;
+    what fires back is in the other run."""
+    for light, rate in ((0.0, 6.0), (0.5, 3.75), (1.0, 1.5)):
+        sensor = plain_sensor()._replace(noise=jnp.float32(6.0))
+        image = jnp.full((90, 100), light)
+        state, noise, back = module.first_state(sensor, image), 0, 0
+        step = jax.jit(module.step)
+        for _ in range(20):  # of 10 ms
+            state, runs = step(sensor, state, image, jnp.int32(10_000))
+            noise, back = noise + int(runs[1].count.sum()), back + int(runs[0].count.sum())
+        assert noise == pytest.approx(0.2 * rate * image.size, abs=4 * np.sqrt(0.2 * rate * 9000))
+        assert 0.3 * noise < back < noise
+
+
+def test_shot_noise_is_taken_back_and_never_adds_up():
+    """The reference follows what fired, so the events of a pixel keep saying where L is: never off
+    by more than the two thresholds, whatever L does. At rest most events have another polarity than
+    the pixel's last, where drawn ones would have half of the time."""
+    times = np.arange(0, 2_000_001, 10_000)
+    for logs in (random_logs(7, times), np.full((len(times), H, W), -2.0)):
+        events = listed(plain_sensor()._replace(noise=jnp.float32(20.0)), times, logs)
+        assert np.all(np.diff(events.t) >= 0)
+        said = np.zeros((len(times), H, W))
+        change = np.where(events.p, 0.2, -0.17)
+        np.add.at(said, (np.searchsorted(times, events.t), events.y, events.x), change)
+        error = logs - logs[0] - np.cumsum(said, 0)
+        assert error.max() <= 0.2 + 0.17 + 1e-3 and error.min() >= -0.2 - 0.17 - 1e-3
+    signs = [at_pixel(events, y, x)[1] for y in range(H) for x in range(W)]
+    same = np.concatenate([np.diff(p) == 0 for p in signs])
+    assert len(events) > 2000 and same.mean() < 0.35
 
 
 def test_hot_pixels_are_few_and_fire_all_the_time():
