@@ -85,6 +85,7 @@ def main():
     parser.add_argument("runs", type=Path)
     parser.add_argument("--images", type=Path)
     parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--only", nargs="+", choices=CANDIDATES, default=list(CANDIDATES))
     options = parser.parse_args()
     budget = replace(
         SETTINGS,
@@ -94,13 +95,14 @@ def main():
         batch=2,
         crop=64,
         chain=2,
-        warmup=50,
+        warmup=min(50, options.steps - 1),
         optimiser="muon",
         learning_rate=3e-3,
         validate_every=options.steps,
     )
-    for name, loss in CANDIDATES.items():
-        run(replace(budget, output=options.runs / name.replace(" ", ""), loss=loss))
+    for name in options.only:
+        folder = options.runs / name.replace(" ", "")
+        run(replace(budget, output=folder, loss=CANDIDATES[name]))
 
     textures = jnp.asarray(load_textures(photographs(HELD_OUT), 40, 256, seed=0))
     simulate = jax.jit(
@@ -116,7 +118,7 @@ def main():
     )
     datas = [simulate(jax.random.key(n), textures) for n in range(BATCHES)]
     rows, sheet = {}, [np.concatenate([np.asarray(data.images[-1, 0]) for data in datas], 1)]
-    for name in CANDIDATES:
+    for name in options.only:
         path = options.runs / name.replace(" ", "") / "last.npz"
         rows[name], pictures = judged(path, datas)
         sheet.append(pictures)

@@ -35,6 +35,7 @@ def main():
     parser.add_argument("runs", type=Path)
     parser.add_argument("--images", type=Path)
     parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--only", nargs="+", choices=CANDIDATES, default=list(CANDIDATES))
     options = parser.parse_args()
     budget = replace(
         REAL,
@@ -44,14 +45,14 @@ def main():
         crop=64,
         windows=16,
         chain=1,
-        warmup=40,
+        warmup=min(40, options.steps - 1),
         validate_every=50,
     )
     rows = {}
     figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
-    for name, choices in CANDIDATES.items():
+    for name in options.only:
         folder = options.runs / name.replace(", rate ", "_")
-        run(replace(budget, output=folder, **choices))
+        run(replace(budget, output=folder, **CANDIDATES[name]))
         entries = [json.loads(line) for line in (folder / "log.jsonl").open()]
         validations = [entry for entry in entries if entry["kind"] == "validation"]
         rows[name] = validations[-1]

@@ -61,11 +61,20 @@ def on_this_device(name: str) -> str:
     return name if backend == "cpu" else f"{name}_{backend}"
 
 
+def _processor() -> str:
+    """Its model, which Python does not know on Linux."""
+    about = Path("/proc/cpuinfo")
+    lines = about.read_text().splitlines() if about.exists() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor()
+
+
 def machine() -> dict:
     """What all numbers depend on."""
     return {
         "platform": platform.platform(terse=True),
         "processors": os.cpu_count(),
+        "processor": _processor(),
         "device": jax.devices()[0].device_kind,
         "jax": jax.__version__,
     }

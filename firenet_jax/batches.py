@@ -33,7 +33,7 @@ from firenet_jax.tensors import BINS, Packed, pack, voxelise
 from firenet_jax.warp import warp
 
 SUFFIXES = (".h5", ".hdf5")
-HELD_OUT = 20  # of so many files one is for validation, as in the paper
+ONE_IN = 20  # of so many files one is for validation, as in the paper
 THREADS, AHEAD = 2, 4  # that read, and batches that wait; HDF5 lets one thread in at a time
 
 
@@ -102,7 +102,7 @@ def split(folder: Path) -> tuple[list[Path], list[Path]]:
     held = [path for path in files if names[path].startswith("validation/")]
     if not held:
         order = sorted(files, key=lambda path: hashlib.sha256(names[path].encode()).digest())
-        held = sorted(order[: max(1, len(files) // HELD_OUT)])
+        held = sorted(order[: max(1, len(files) // ONE_IN)])
     kept = [path for path in files if path not in set(held)]
     if not kept:
         raise RecordingError(

@@ -12,6 +12,7 @@ import importlib.resources
 import os
 import zipfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -19,11 +20,12 @@ import numpy as np
 import tyro
 
 from firenet_jax.network import BINS, CHANNELS, Weights
-from firenet_jax.pytorch_file import CheckpointError, read_state_dict
+from firenet_jax.pytorch_file import CheckpointError, identify, read_state_dict, refuse_unused, take
 
 FORMAT = 1
 MAX_BYTES = 2**20  # six times a whole file: what claims more is no FireNet and is not read
 PYTORCH = (".pth", ".pt", ".tar", ".ckpt")
+BUILT_IN = "built-in"
 TRY = "pass a .npz written by this program or a FireNet or FireNet+ checkpoint of PyTorch (.pth)"
 
 # layer -> (kernel size, inputs, outputs), in the order of the network
@@ -49,7 +51,11 @@ for _layer, (_size, _inputs, _outputs) in LAYERS.items():
 
 
 def save_weights(path: str | Path, weights: Weights) -> None:
-    """Writes beside the final name and renames: a file with that name is always whole."""
+    """Writes beside the final name and renames: a file with that name is always whole.
+
+    Raises CheckpointError where the name is no .npz, the arrays are not FireNet's or not finite, or
+    the file cannot be written.
+    """
     path = Path(path)
     if path.suffix != ".npz":
         raise CheckpointError(f"{path}: weights are written as .npz; give it that ending")
@@ -73,9 +79,10 @@ def save_weights(path: str | Path, weights: Weights) -> None:
 def load_weights(path: str | Path | None = None) -> Weights:
     """Weights from a .npz, a PyTorch checkpoint or the folder of a training run.
 
-    None: the weights that come with the package.
+    None or "built-in": the weights that come with the package.
+    Raises CheckpointError for a file that is missing, damaged or of another network.
     """
-    if path is None:
+    if path is None or str(path) == BUILT_IN:
         return _load_default()
     path = Path(path)
     if path.is_dir():
@@ -219,63 +226,23 @@ def convert(path: str | Path) -> Weights:
     """PyTorch checkpoint of FireNet or FireNet+ -> Weights: OIHW -> HWIO, two gates -> one."""
     path = Path(path)
     tensors = read_state_dict(path)
-    prefix, names = _family(path, tensors)
-    used = set()
-
-    def take(name: str, shape: tuple[int, ...]) -> np.ndarray:
-        found = tensors.get(prefix + name)
-        if found is None:
-            raise CheckpointError(f"{path} holds no FireNet: {prefix + name!a} is missing; {TRY}")
-        if found.shape != shape or found.dtype.kind != "f":
-            raise CheckpointError(
-                f"{path} holds no FireNet: {prefix + name!a} should be floats {shape} and is "
-                f"{found.dtype} {found.shape}; {TRY}"
-            )
-        used.add(prefix + name)
-        with np.errstate(over="ignore"):  # float64 beyond float32 becomes inf: refused below
-            return found.astype(np.float32)
+    firsts = {family: f"{names.blocks['head']}.weight" for family, names in FAMILIES.items()}
+    family, prefix = identify(tensors, firsts, path, "FireNet", TRY)
+    names = FAMILIES[family]
+    ours = partial(take, tensors, prefix, path, "FireNet", TRY)
 
     flat = {}
     for layer, (size, inputs, outputs) in LAYERS.items():
         block, _, part = layer.partition("/")
         sources = [names.blocks[block] + ending for ending in PARTS[part]]
         each = outputs // len(sources)
-        kernels = [take(f"{source}.weight", (each, inputs, size, size)) for source in sources]
-        biases = [take(f"{source}.bias", (each,)) for source in sources]
+        kernels = [ours(f"{source}.weight", (each, inputs, size, size)) for source in sources]
+        biases = [ours(f"{source}.bias", (each,)) for source in sources]
         flat[f"{layer}/kernel"] = np.concatenate(kernels).transpose(2, 3, 1, 0).copy()
         flat[f"{layer}/bias"] = np.concatenate(biases)
 
-    for name in tensors:  # a layer that we would leave out: the images would be quietly wrong
-        if name.startswith(prefix) and name not in used:
-            raise CheckpointError(
-                f"{path} holds no FireNet: FireNet has no place for {name!a}; {TRY}"
-            )
-    _check(path, flat, "holds no FireNet")
+    refuse_unused(tensors, prefix, path, "FireNet", TRY)
     return Weights(params=_unflatten(flat), normalise=names.normalise)
-
-
-def _family(path: Path, tensors: dict[str, np.ndarray]) -> tuple[str, _Names]:
-    """The family by the name of its first layer, and what stands before it (net., module.)."""
-    found = []
-    for names in FAMILIES.values():
-        first = f"{names.blocks['head']}.weight"
-        found += [
-            (name.removesuffix(first), names)
-            for name in tensors
-            if name == first or name.endswith("." + first)
-        ]
-    if not found:
-        anchors = " or ".join(f"{n.blocks['head']}.weight ({f})" for f, n in FAMILIES.items())
-        raise CheckpointError(
-            f"{path} holds no FireNet: expected {anchors}, found {len(tensors)} other names, "
-            f"the first {next(iter(tensors))!a}; {TRY}"
-        )
-    if len(found) > 1:
-        raise CheckpointError(
-            f"{path} holds several networks ({', '.join(repr(prefix) for prefix, _ in found)}); "
-            "save one of them alone"
-        )
-    return found[0]
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,8 @@ def usage() -> str:
             "",
             *lines,
             "",
-            "firenet COMMAND --help explains a command, with examples.",
+            "firenet COMMAND --help explains a command, with examples. FIRENET_DEBUG=1 in the",
+            "environment shows where an error came from.",
         ]
     )
 

@@ -35,7 +35,14 @@ import tyro
 from tqdm import tqdm
 
 from firenet_jax.events import Events, concatenate, parse_size
-from firenet_jax.files import OutputError, differences, partial_name, write_text, writing
+from firenet_jax.files import (
+    OutputError,
+    differences,
+    locked,
+    partial_name,
+    write_text,
+    writing,
+)
 from firenet_jax.overlap import ahead
 from firenet_jax.scenes import (
     Scene,
@@ -255,8 +262,17 @@ def run(settings: Simulate) -> list[Path]:
     OutputError or ValueError with a message of one sentence."""
     if settings.video is not None:
         return [simulate_clip(settings)]
-    height, width = parse_size(settings.sensor_size or "240x180")
+    parse_size(settings.sensor_size or "240x180")
     open_folder(settings)
+    with locked(settings.output):
+        return write_sequences(settings)
+
+
+def write_sequences(settings: Simulate) -> list[Path]:
+    """Writes those that are not in the folder yet."""
+    for left in settings.output.glob("*/*.partial.h5"):  # of a run that was killed
+        left.unlink()
+    height, width = parse_size(settings.sensor_size or "240x180")
     sensor = with_faults(settings.sensor) if settings.faults else settings.sensor
     record = describe(settings)
     held_out = settings.sequences // 20 if settings.validation is None else settings.validation
@@ -406,8 +422,6 @@ def open_folder(settings: Simulate) -> None:
     try:
         for name in ("train", "validation"):
             (folder / name).mkdir(parents=True, exist_ok=True)
-            for left in (folder / name).glob("*.partial.h5"):  # of a run that was killed
-                left.unlink()
         if not kept.is_file():
             write_text(kept, json.dumps(record, indent=1) + "\n")
     except OSError as error:

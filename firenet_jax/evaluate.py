@@ -83,9 +83,9 @@ class Evaluate:
     """Compare methods with the frames of recordings: a table, JSON, CSV and a report to look at.
 
     Examples:
-      firenet evaluate dynamic_6dof.zip boxes_6dof.zip -o report/ --weights firenet.npz
+      firenet evaluate dynamic_6dof.zip boxes_6dof.zip -o report/
       firenet evaluate simulated/ -o report/ --methods firenet,hf,mr
-      firenet evaluate hqf/*.h5 -o report/ --weights ours.npz firenet_plus.pth --equalise local
+      firenet evaluate hqf/*.h5 -o report/ --weights built-in firenet_plus.pth --equalise local
     """
 
     data: Annotated[
@@ -101,7 +101,7 @@ class Evaluate:
     """Of firenet, e2vid, hf (high-pass filter) and mr (manifold regularisation), with commas."""
     weights: Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-c"])] = ()
     """Weights of FireNet or FireNet+: each file is a method named after it. Without any: those
-    that come with the package."""
+    that come with the package, which are named built-in."""
     e2vid_weights: Path | None = None
     """E2VID's published checkpoint, or E2VID+'s."""
     e2vid_sigmoid: bool = True
@@ -225,7 +225,7 @@ def run(settings: Evaluate) -> dict:
         raise RecordingError(f"nothing can be evaluated: {' / '.join(reason[0])}: {reason[1]}")
 
     results = summarise(settings, shared, plans, recordings, methods, done, gaps)
-    write_all(settings, results, plans, by_name)
+    write_all(settings, results, plans, done)
     return results
 
 
@@ -566,24 +566,27 @@ def protocol(settings: Evaluate) -> list[str]:
     ]
 
 
-def write_all(settings: Evaluate, results: dict, plans: dict[str, Plan], methods: dict) -> None:
+def write_all(settings: Evaluate, results: dict, plans: dict[str, Plan], done: dict) -> None:
     """Prints the table; writes results.json, table.csv, the videos and index.html."""
     folder = settings.output
     write_text(folder / "results.json", json.dumps(results, indent=1, allow_nan=False))
     write_text(folder / "table.csv", report.spreadsheet(results))
-    shown = {name: show(settings, plan, methods) for name, plan in plans.items()}
+    shown = {name: show(settings, plan, done) for name, plan in plans.items()}
     write_text(folder / "index.html", report.page(results, shown))
     print(report.table(results))
     print(f"\n{folder / 'index.html'}: the report; table.csv and results.json beside it")
 
 
-def show(settings: Evaluate, plan: Plan, methods: dict) -> report.Shown:
-    """The pictures of a sequence side by side, the frames first, and its video on disk."""
-    kept = {}
-    for name in methods:
-        path = result_file(settings, plan.name, name).with_suffix(".npz")
-        if path.is_file():
-            kept[name] = read_arrays(path)
+def show(settings: Evaluate, plan: Plan, done: dict) -> report.Shown:
+    """The pictures of a sequence side by side, the frames first, and its video on disk.
+
+    Only of what is done: what became a gap may have pictures of other settings on disk.
+    """
+    kept = {
+        method: read_arrays(result_file(settings, name, method).with_suffix(".npz"))
+        for name, method in done
+        if name == plan.name
+    }
     truths: dict[int, np.ndarray] = {}
 
     def truth(number: int) -> np.ndarray:

@@ -5,6 +5,7 @@ the error names it.
 """
 
 import contextlib
+import os
 from pathlib import Path
 
 import numpy as np
@@ -49,8 +50,8 @@ def writing(path: Path):
         ) from error
 
 
-def alone(file, path: Path) -> None:
-    """Holds an open file until it is closed or its process ends, however it does.
+def lock(handle: int, path: Path) -> None:
+    """Locks an open file or folder until it is closed or its process ends, however it does.
 
     Raises OutputError where another run holds it. Does nothing where there are no such locks.
     """
@@ -59,14 +60,37 @@ def alone(file, path: Path) -> None:
     except ImportError:  # Windows
         return
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        file.close()
         raise OutputError(
             f"{path}: another run is writing it: wait for that, or choose another output"
         ) from None
     except OSError:  # some network disks
         return
+
+
+def lock_file(file, path: Path) -> None:
+    """Locks an open file, which it closes where another run holds it."""
+    try:
+        lock(file.fileno(), path)
+    except OutputError:
+        file.close()
+        raise
+
+
+@contextlib.contextmanager
+def locked(folder: Path):
+    """No other run can lock this folder meanwhile. Raises OutputError where one has."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except PermissionError:  # Windows opens no folders
+        yield
+        return
+    try:
+        lock(handle, folder)
+        yield
+    finally:
+        os.close(handle)
 
 
 def write_text(path: Path, text: str) -> None:

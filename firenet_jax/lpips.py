@@ -11,6 +11,7 @@ Images are (..., H, W) grey, nominally 0 to 1 and not clipped here, 31x31 pixels
 """
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from firenet_jax.pytorch_file import CheckpointError, read_state_dict
+from firenet_jax.pytorch_file import identify, read_state_dict, take
 
 SMALLEST = 31  # pixels of a side: AlexNet's last pool then makes one of them
 # of the three colours in -1 to 1: ImageNet's means and deviations, rounded
@@ -188,47 +189,22 @@ def load(backbone_file: str | Path, linear_file: str | Path) -> Lpips:
     a ValueError, for what cannot be read and for names, shapes and values that do not fit.
     """
     tensors = read_state_dict(backbone_file)
-    network = next((network for network in NETWORKS if network.mark in tensors), None)
-    if network is None:
-        marks = " or ".join(f"{network.mark} ({network.title})" for network in NETWORKS)
-        raise CheckpointError(
-            f"{backbone_file} holds no network of LPIPS: expected {marks}, found {len(tensors)} "
-            f"other names, the first {next(iter(tensors))!a}; {BACKBONES}"
-        )
+    marks = {network.title: network.mark for network in NETWORKS}
+    title, prefix = identify(tensors, marks, backbone_file, "network of LPIPS", BACKBONES)
+    network = next(network for network in NETWORKS if network.title == title)
 
+    ours = partial(take, tensors, prefix, backbone_file, title, BACKBONES)
     convolutions = {}
     for name, shape in network.shapes.items():
-        problem = f"{backbone_file} holds no {network.title}"
-        kernel = _take(tensors, f"{name}.weight", shape, problem, BACKBONES)
-        bias = _take(tensors, f"{name}.bias", shape[:1], problem, BACKBONES)
+        kernel, bias = ours(f"{name}.weight", shape), ours(f"{name}.bias", shape[:1])
         convolutions[name] = jnp.asarray(kernel.transpose(2, 3, 1, 0)), jnp.asarray(bias)
 
     tensors = read_state_dict(linear_file)
-    problem = f"{linear_file} holds no linear layers of LPIPS for {network.title}"
+    kind = f"linear layers of LPIPS for {title}"
     advice = f"pass {network.linear_file} of the lpips package"
+    ours = partial(take, tensors, "", linear_file, kind, advice)
     linear = tuple(
-        jnp.asarray(
-            _take(tensors, f"lin{k}.model.1.weight", (1, channels, 1, 1), problem, advice).ravel()
-        )
+        jnp.asarray(ours(f"lin{k}.model.1.weight", (1, channels, 1, 1)).ravel())
         for k, channels in enumerate(network.channels)
     )
     return Lpips(convolutions, linear)
-
-
-def _take(
-    tensors: dict[str, np.ndarray], name: str, shape: tuple[int, ...], problem: str, advice: str
-) -> np.ndarray:
-    """The named tensor as float32, or a CheckpointError of problem, reason and advice."""
-    found = tensors.get(name)
-    if found is None:
-        raise CheckpointError(f"{problem}: {name!a} is missing; {advice}")
-    if found.shape != shape or found.dtype.kind != "f":
-        raise CheckpointError(
-            f"{problem}: {name!a} should be floats {shape} and is {found.dtype} {found.shape}; "
-            f"{advice}"
-        )
-    with np.errstate(over="ignore"):  # float64 beyond float32 becomes inf: refused here
-        found = found.astype(np.float32)
-    if not np.isfinite(found).all():
-        raise CheckpointError(f"{problem}: {name!a} has values that are not finite; {advice}")
-    return found

@@ -107,7 +107,7 @@ def psnr(image: jax.Array, truth: jax.Array, *, data_range: float = 1.0) -> jax.
     return jnp.where(differ, 10 * jnp.log10(ratio), jnp.inf)
 
 
-def _ssim_factors(image, truth, sigma, data_range, border) -> tuple[jax.Array, jax.Array]:
+def _ssim_factors(image, truth, sigma, data_range) -> tuple[jax.Array, jax.Array]:
     """The two maps whose product is SSIM: luminance l, contrast times structure cs.
 
     From sum s = I + G and difference d = I - G, so that equal images give exactly 1:
@@ -118,7 +118,7 @@ def _ssim_factors(image, truth, sigma, data_range, border) -> tuple[jax.Array, j
     middle = data_range  # of s; variances do not see it go, and float32 has more digits for them
     s, d = image + truth - middle, image - truth
     mean_s, mean_d, square_s, square_d = (
-        _filter(map_, weights, weights, border) for map_ in (s, d, s**2, d**2)
+        _filter(map_, weights, weights) for map_ in (s, d, s**2, d**2)
     )
     variance_s, variance_d = square_s - mean_s**2, square_d - mean_d**2
     cs = (variance_s - variance_d + c2) / (variance_s + variance_d + c2)
@@ -138,20 +138,8 @@ def ssim(
     image. Equals skimage's structural_similarity with gaussian_weights=True and
     use_sample_covariance=False.
     """
-    luminance, cs = _ssim_factors(*_compared(image, truth), sigma, data_range, "valid")
+    luminance, cs = _ssim_factors(*_compared(image, truth), sigma, data_range)
     return _mean(luminance * cs)
-
-
-@partial(jax.jit, static_argnames=("sigma", "data_range"))
-def ssim_map(
-    image: jax.Array, truth: jax.Array, *, sigma: float = 1.5, data_range: float = 1.0
-) -> jax.Array:
-    """(..., H, W): SSIM at every pixel, the images mirrored beyond their border.
-
-    Equals the map of skimage; `ssim` is its mean without a margin of int(3.5 sigma + 0.5) pixels.
-    """
-    luminance, cs = _ssim_factors(*_compared(image, truth), sigma, data_range, "symmetric")
-    return luminance * cs
 
 
 SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
@@ -180,7 +168,7 @@ def ms_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     weights = np.array(SCALES[:scales]) / sum(SCALES[:scales])
     product = jnp.ones(image.shape[:-2])
     for scale, weight in enumerate(weights.tolist()):
-        luminance, cs = _ssim_factors(image, truth, 1.5, 1.0, "valid")
+        luminance, cs = _ssim_factors(image, truth, 1.5, 1.0)
         last = scale == scales - 1
         product *= _power(_mean(luminance * cs if last else cs), weight)
         if not last:

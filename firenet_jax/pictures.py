@@ -144,7 +144,7 @@ def event_pictures(tensors: jax.Array) -> jax.Array:
 
     The colour is that of the sign of a pixel's votes, as in the original program.
     """
-    votes = tensors.sum(-1)[..., None]
+    votes = jnp.round(tensors.sum(-1))[..., None]  # an event's two votes sum to 1 but for rounding
     white, blue, red = (
         jnp.array(colour, jnp.uint8) for colour in ([255] * 3, [0, 0, 255], [255, 0, 0])
     )

@@ -68,6 +68,70 @@ def read_state_dict(path: str | Path) -> dict[str, np.ndarray]:
         raise CheckpointError(f"{path} is damaged or cut short ({reason}); {AGAIN}") from error
 
 
+# ---- from its tensors to a network; path, kind and advice are for the message of an error
+
+Tensors = dict[str, np.ndarray]
+
+
+def identify(
+    tensors: Tensors, firsts: dict[str, str], path: str | Path, kind: str, advice: str
+) -> tuple[str, str]:
+    """Which network the tensors are of: its title, and what stands before its names (net.).
+
+    firsts: title -> the name of a tensor that only this network has. Raises CheckpointError where
+    none of them is found, or more than one.
+    """
+    found = [
+        (title, name.removesuffix(first))
+        for title, first in firsts.items()
+        for name in tensors
+        if f".{name}".endswith(f".{first}")
+    ]
+    if not found:
+        anchors = " or ".join(f"{first} ({title})" for title, first in firsts.items())
+        raise CheckpointError(
+            f"{path} holds no {kind}: expected {anchors}, found {len(tensors)} other names, "
+            f"the first {next(iter(tensors))!a}; {advice}"
+        )
+    if len(found) > 1:
+        prefixes = ", ".join(repr(prefix) for _, prefix in found)
+        raise CheckpointError(f"{path} holds several networks ({prefixes}); save one of them alone")
+    return found[0]
+
+
+def take(
+    tensors: Tensors, prefix: str, path: str | Path, kind: str, advice: str, name: str, shape: tuple
+) -> np.ndarray:
+    """Takes the tensor prefix + name out of the dict: a float32 copy.
+
+    Raises CheckpointError where it is missing, of another shape, not of floats or not finite.
+    """
+    problem = f"{path} holds no {kind}: {prefix + name!a}"
+    found = tensors.pop(prefix + name, None)
+    if found is None:
+        raise CheckpointError(f"{problem} is missing; {advice}")
+    if found.shape != shape or found.dtype.kind != "f":
+        raise CheckpointError(
+            f"{problem} should be floats {shape} and is {found.dtype} {found.shape}; {advice}"
+        )
+    with np.errstate(over="ignore"):  # float64 beyond float32 becomes inf: refused here
+        found = found.astype(np.float32)
+    if not np.isfinite(found).all():
+        raise CheckpointError(f"{problem} has values that are not finite; {advice}")
+    return found
+
+
+def refuse_unused(tensors: Tensors, prefix: str, path: str | Path, kind: str, advice: str) -> None:
+    """Raises CheckpointError where `take` has left a tensor of the network.
+
+    It would be a layer that we leave out: the images would be quietly wrong.
+    """
+    for name in tensors:
+        if name.startswith(prefix):
+            problem = f"{path} holds no {kind}: {kind} has no place for {name!a}"
+            raise CheckpointError(f"{problem}; {advice}")
+
+
 # ---- the two layouts
 
 

@@ -33,7 +33,7 @@ class Network:
     recurrent: bool = True
     """--no-recurrent forgets everything between windows (ablation, Fig. 5 of the paper)."""
     bfloat16: bool = False
-    """Convolutions in bfloat16: faster on accelerators, slower on CPUs, a little less accurate."""
+    """Convolutions in bfloat16, a little less accurate: for accelerators; on a CPU it is slower."""
     pad: int = 1
     """Pad tensors by reflection to a multiple of this; 16 is what the original program does."""
     color: bool = False

@@ -5,7 +5,7 @@ event tensors that never leave the device. Both call `step` for each rendering o
 
     L = log(0.001 + I);  a pixel emits an event, p = +1 or -1, each time L, taken as linear between
     two renderings, crosses reference + p C_p; the reference moves by p C_p, also when the
-    refractory period swallows the event.
+    refractory period swallows the event. Shot noise fires, and moves the reference, without L.
 
 (Rebecq et al., "ESIM: an open event camera simulator", CoRL 2018.) L being linear, the events of a
 pixel between two renderings are equally spaced, and so are those that the refractory period
@@ -38,6 +38,8 @@ THRESHOLD, SPREAD, REFRACTORY = 0.18, 0.03, 1e-3  # as in the paper, where nothi
 TICKS = 1024  # in a microsecond
 AT_ONCE = 4  # events of a pixel in one pass over the picture: fewer passes, less memory traffic
 LONGEST = 2**31 // TICKS - 1  # microseconds between two renderings
+SLOW, SWIFT = (0.02, 0.3), (16.0, 90.0)  # pixels a window, of rare sequences
+CALM = 2 / 3  # of the slow ones: next to no faults, so that single events can be trusted
 
 
 def _or(said: float | None, default: float) -> float:
@@ -74,9 +76,9 @@ class SensorSettings:
     mismatch: float | None = None
     """Standard deviation of each pixel's own thresholds, in log intensity; about 0.03 in life."""
     noise: tuple[float, float] | None = None
-    """Shot noise: events per second of a pixel in the dark that have no cause; in full light there
-    are a quarter as many. As they move the reference too, most are soon taken back by an event of
-    the other polarity. At most one of a pixel between two renderings."""
+    """Shot noise: events per second of a pixel in the dark, where L need not change; in full light
+    there are a quarter as many. They move the reference too, so ON and OFF alternate. At most one
+    of a pixel between two renderings."""
     leak: tuple[float, float] | None = None
     """ON events per second by which every pixel's reference drifts, about 0.1 in sensors."""
     hot: tuple[float, float] | None = None
@@ -145,10 +147,10 @@ class Sensor(NamedTuple):
     off: jax.Array
     refractory: jax.Array | None  # () int32, ticks
     drift: jax.Array | None  # (H, W) log intensity per second, by which L seems to rise
-    noise: jax.Array | None  # () events per second and pixel
+    noise: jax.Array | None  # () events per second and pixel in the dark
     cutoff: jax.Array | None  # (2,) hertz in full light, and the part of it left in the dark
-    phase: jax.Array | None  # (H, W) part of the first threshold already gone, where L drifts:
-    # else all pixels would leak their first event at the same time
+    phase: jax.Array | None  # (H, W) in [0, 1), where a pixel begins on its way to a threshold, if
+    # L drifts, or between both, if there is noise: else all would begin with the same event
     key: jax.Array  # of the noise
 
 
@@ -199,8 +201,9 @@ def random_sensor(
     on, off = (jnp.maximum(threshold, 0.01) for threshold in (on, off))  # as in ESIM
 
     drift = phase = None
-    if _on(settings.leak) or _on(settings.hot):
+    if _on(settings.leak) or _on(settings.hot) or _on(settings.noise):
         chance, sign, rate, phase = jax.random.uniform(drift_key, (4, *shape))
+    if _on(settings.leak) or _on(settings.hot):
         drift = jnp.zeros(shape)
         if _on(settings.leak):
             drift += on * log_uniform(settings.leak)
@@ -232,10 +235,12 @@ def log_intensity(image: jax.Array) -> jax.Array:
 
 
 def first_state(sensor: Sensor, image: jax.Array) -> SensorState:
-    """The first rendering (H, W) sets every pixel's reference."""
+    """The first rendering (H, W) sets every pixel's reference, which noise has moved already."""
     log = log_intensity(image)
     above = jnp.zeros_like(log)
-    if sensor.drift is not None:
+    if sensor.noise is not None:
+        above = (sensor.on + sensor.off) * sensor.phase - sensor.off
+    elif sensor.drift is not None:
         drifted = jnp.where(sensor.drift > 0, sensor.on, -sensor.off) * sensor.phase
         above = jnp.where(sensor.drift != 0, drifted, above)
     silent = None if sensor.refractory is None else jnp.zeros(image.shape, jnp.int32)
@@ -261,10 +266,10 @@ def step(
     if sensor.drift is not None:
         rise = rise + seconds * sensor.drift  # seen from a reference that sinks, L rises
 
-    above = state.above + rise
-    up = above > 0
+    up = rise > 0
     polarity = jnp.where(up, 1.0, -1.0)
     threshold = jnp.where(up, sensor.on, sensor.off)
+    above = state.above + rise
     crossings = jnp.maximum(jnp.floor(polarity * above / threshold), 0.0)
     size = jnp.abs(rise)
     size = jnp.where(size > 0, size, 1.0)  # no rise, no crossing: anything finite will do
@@ -275,10 +280,6 @@ def step(
     first = jnp.clip(jnp.round(first * scale), 0.0, ticks.astype(jnp.float32)).astype(jnp.int32)
     spacing = jnp.minimum(threshold * scale, ticks.astype(jnp.float32)).astype(jnp.int32)
     count = crossings.astype(jnp.int32)
-    if sensor.noise is not None:
-        # Noise may have left the pixel beyond a threshold: it crosses that at once, so late that
-        # the crossings after it would not fit.
-        spacing = jnp.minimum(spacing, (ticks - first) // jnp.maximum(count - 1, 1))
     above = above - polarity * threshold * crossings
     run = Run(first, spacing, count, polarity)
     silent = None
@@ -288,9 +289,11 @@ def step(
     runs = (run,)
     if sensor.noise is not None:
         key = jax.random.fold_in(sensor.key, state.renderings)
-        level = above / jnp.where(above > 0, sensor.on, sensor.off)
-        noise = _shot_noise(key, seconds * sensor.noise * (1 - 0.75 * image), level, ticks)
-        above = above - noise.count * jnp.where(noise.polarity > 0, sensor.on, -sensor.off)
+        # Towards the threshold from which the reference stays between both: that is one of the two.
+        up = above > sensor.on - sensor.off
+        expected = seconds * sensor.noise * (1 - 0.75 * image)
+        noise = _shot_noise(key, expected, jnp.where(up, 1.0, -1.0), ticks)
+        above = above - noise.count * jnp.where(up, sensor.on, -sensor.off)
         runs += (noise,)
     return SensorState(after, above, silent, state.renderings + 1), runs
 
@@ -315,26 +318,20 @@ def _refractory(run: Run, silent: jax.Array, refractory: jax.Array, ticks: jax.A
     return Run(first, spacing, count, run.polarity), jnp.maximum(silent - ticks, 0)
 
 
-def _shot_noise(key: jax.Array, expected: jax.Array, level: jax.Array, ticks: jax.Array) -> Run:
-    """At most one event a pixel and interval, at any time in it.
+def _shot_noise(key: jax.Array, expected: jax.Array, polarity: jax.Array, ticks: jax.Array) -> Run:
+    """At most one event a pixel and interval, at any time in it; expected: (H, W) events.
 
-    expected: (H, W) events; level: (H, W) where the pixel is between its thresholds, OFF at -1 and
-    ON at 1. The nearer one is crossed the more easily: ON has the share (1 + level) / 2. The rate's
-    fall with light is that of Hu, Liu and Delbruck, "v2e", CVPRW 2021, and as there the reference
-    follows; but noise does not wait for the refractory period. One random number decides all: where
-    it is below the probability, it is uniform below it.
+    Its rate falls with light, and the reference follows, as in Hu, Liu and Delbruck, "v2e", CVPRW
+    2021; but it does not wait for the refractory period. One random number decides all: where it is
+    below the probability, it is uniform below it.
     """
     # Not that of at least one event of a Poisson process, 1 - exp(-expected): as no interval has
     # more than one, the rate that was asked for would be missed by a quarter at 0.6.
     chance = jnp.minimum(expected, 1.0)
-    number = jax.random.bits(key, level.shape, jnp.uint32).astype(jnp.float32) * 2.0**-32
+    number = jax.random.bits(key, polarity.shape, jnp.uint32).astype(jnp.float32) * 2.0**-32
     fires = number < chance
-    place = number / jnp.where(chance > 0, chance, 1.0)  # [0, 1): polarity and time
-    share = jnp.clip(0.5 + 0.5 * level, 0.0, 1.0)
-    on = place < share
-    part = jnp.where(on, place, place - share) / jnp.where(on, share, 1 - share)
-    first = (ticks.astype(jnp.float32) * jnp.where(fires, part, 0.0)).astype(jnp.int32)
-    polarity = jnp.where(on, 1.0, -1.0)
+    place = jnp.where(fires, number / jnp.where(fires, chance, 1.0), 0.0)
+    first = (ticks.astype(jnp.float32) * place).astype(jnp.int32)
     return Run(first, jnp.zeros_like(first), fires.astype(jnp.int32), polarity)
 
 
@@ -504,6 +501,15 @@ def _votes(planes: jax.Array, low, runs, passed: jax.Array, total: jax.Array) ->
     return jnp.stack(planes)
 
 
+def check_rare(slow: float, swift: float) -> None:
+    """Raises ValueError where these are no parts of the sequences, or leave none for `motion`."""
+    if not (slow >= 0 and swift >= 0 and slow + swift < 1):
+        raise ValueError(
+            f"slow is {slow} and swift is {swift}, but they are parts of the sequences: 0 or more, "
+            "together less than 1"
+        )
+
+
 @partial(
     jax.jit,
     static_argnames=(
@@ -513,6 +519,8 @@ def _votes(planes: jax.Array, low, runs, passed: jax.Array, total: jax.Array) ->
         "width",
         "renderings",
         "motion",
+        "slow",
+        "swift",
         "scene",
         "sensor",
     ),
@@ -527,6 +535,8 @@ def random_setups(
     width: int,
     renderings: int = 5,
     motion: tuple[float, float] = (1.25, 2.5),
+    slow: float = 0.0,
+    swift: float = 0.0,
     scene: SceneSettings = SceneSettings(),
     sensor: SensorSettings = SensorSettings(),
 ) -> tuple[Sensor, Scene, jax.Array]:
@@ -534,14 +544,18 @@ def random_setups(
 
     The windows of a sequence all last equally long: so that at its fastest time the fastest point
     moves by so many pixels as `motion` says (least, greatest; log-uniform), but 1 to 300 ms.
-    Raises ValueError where that is more than a pixel from one rendering to the next, the bound of
-    Gehrig et al., "Video to Events", CVPR 2020.
+    slow, swift: parts of the sequences in which next to nothing moves (`SLOW` pixels a window, in
+    most of these with a fiftieth of noise and leaks), and in which much does before a blank ground
+    (`SWIFT` pixels, from one rendering to the next by more than one).
+    Raises ValueError where `motion` is more than a pixel from one rendering to the next, the bound
+    of Gehrig et al., "Video to Events", CVPR 2020, or slow and swift leave nothing.
     """
     if motion[1] > renderings:
         raise ValueError(
             f"windows with {motion[1]} pixels of motion need {math.ceil(motion[1])} "
             f"renderings, not {renderings}"
         )
+    check_rare(slow, swift)
     scene_key, sensor_key, number_key = jax.random.split(key, 3)
     numbers = jax.random.uniform(number_key, (2, batch))
 
@@ -549,10 +563,14 @@ def random_setups(
         low, high = (math.log(bound) for bound in bounds)
         return jnp.exp(low + (high - low) * numbers)
 
-    speed = log_uniform(scene.speed, numbers[0])
-    duration = 1e6 * log_uniform(motion, numbers[1]) / speed
-    duration = jnp.clip(duration, 1e3, 3e5).astype(jnp.int32)
-    speed = jnp.minimum(speed, 1e6 * renderings / duration)
+    speed, kind = log_uniform(scene.speed, numbers[0]), numbers[1]
+    is_slow, is_swift = kind < slow, kind >= 1 - swift
+    pixels = log_uniform(motion, jnp.clip((kind - slow) / (1 - slow - swift), 0, 1))
+    pixels = jnp.where(is_slow, log_uniform(SLOW, kind / (slow or 1)), pixels)
+    pixels = jnp.where(is_swift, log_uniform(SWIFT, (kind - 1 + swift) / (swift or 1)), pixels)
+    duration = jnp.clip(1e6 * pixels / speed, 1e3, 3e5).astype(jnp.int32)
+    usual = jnp.minimum(speed, 1e6 * renderings / duration)
+    speed = jnp.where(is_slow | is_swift, 1e6 * pixels / duration, usual)
     size = {"height": height, "width": width}
 
     def one_scene(key, duration, speed):
@@ -562,6 +580,17 @@ def random_setups(
     scenes = jax.vmap(one_scene)(jax.random.split(scene_key, batch), duration, speed)
     one_sensor = partial(random_sensor, settings=sensor, **size)
     sensors = jax.vmap(one_sensor)(jax.random.split(sensor_key, batch))
+    if slow:
+        calm = jnp.where(kind < CALM * slow, 0.02, 1.0)
+        if sensors.noise is not None:
+            sensors = sensors._replace(noise=sensors.noise * calm)
+        if sensors.drift is not None:
+            sensors = sensors._replace(drift=sensors.drift * calm[:, None, None])
+    if swift:
+        grey_key = jax.random.fold_in(number_key, 1)
+        grey = jax.random.uniform(grey_key, (batch, 1, 1), minval=0.2, maxval=0.8)
+        ground = jnp.where(is_swift[:, None, None], grey, scenes.textures[0])
+        scenes = scenes._replace(textures=(ground, *scenes.textures[1:]))
     bounds = jnp.arange(windows + 1, dtype=jnp.int32)[:, None] * duration[None]
     return sensors, scenes, bounds
 

@@ -29,8 +29,9 @@ from firenet_jax.windows import Windows, cut
 BINS = 5
 
 # A flat list of events is padded to one of these sizes: at most 8 times too long, at a few ns
-# for each event too many, against a compilation of seconds for each new size.
-CAPACITIES = tuple(2**14 * 8**k for k in range(6))
+# for each event too many, against a compilation of seconds for each new size; from a million on
+# at most twice, because there it is memory that counts.
+CAPACITIES = 2**14, 2**17, *(2**k for k in range(20, 30))
 
 BLOCK, BLOCKS = 2**17, 8  # events that vote at once on a CPU, and how many such steps in a row
 
@@ -71,7 +72,11 @@ def pack(
     size: padded length, at least the number of events; None: `capacity` of it.
     bounds: (T, B, 2) int64 microseconds, t_min and t_max of each window; None: the times of its
     first and its last event, the least and the greatest, as events are in time order.
+    Raises ValueError where rows are missing or of unequal length, the events do not fit into
+    `size`, or there are 2^15 windows or more.
     """
+    if not windows or not windows[0] or {len(row) for row in windows} != {len(windows[0])}:
+        raise ValueError("windows are T rows of B windows each, T and B at least 1")
     shape = len(windows), len(windows[0])
     flat = [window for row in windows for window in row]
     counts = np.array([len(window) for window in flat])
@@ -172,6 +177,7 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
 
     Every event votes in the two bins around its time. Events outside the sensor vote nowhere;
     events of one single time all vote in bin 0; a window without events gives zeros.
+    Raises ValueError where the tensors would have 2^31 numbers or more.
     """
     steps, batch = packed.t_min.shape
     windows, plane = steps * batch, height * width
@@ -241,8 +247,12 @@ def event_tensors(
 
     times: microseconds of each window's last event; of its end where it holds none. chunk: T; the
     last chunk may be shorter, and programs that take it are then compiled for that length too.
-    windows: the fields of `windows.Windows`, such as events_per_pixel=0.35 (the default).
+    windows, of which one may be given: events_per_pixel=0.35 (the default), events (a number),
+    duration (milliseconds) or between_frames=True; see `windows.Windows` for more.
+    Raises ValueError for windows that cannot be, RecordingError where the file is damaged.
     """
+    if chunk < 1:
+        raise ValueError(f"chunk is {chunk}, but must be 1 or more windows")
     size = 0
     for group in in_groups(cut(recording, Windows(**windows)), chunk):
         rows = [[window.events] for window in group]

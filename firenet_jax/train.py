@@ -57,7 +57,7 @@ from firenet_jax.devices import (
     shared,
 )
 from firenet_jax.events import logger
-from firenet_jax.files import differences, write_text
+from firenet_jax.files import differences, locked, write_text
 from firenet_jax.losses import DISTANCES, Loss, sequence_loss
 from firenet_jax.network import (
     CONVOLVED,
@@ -74,6 +74,7 @@ from firenet_jax.sensor import (
     SensorSettings,
     SensorState,
     Simulation,
+    check_rare,
     first_states,
     random_setups,
     simulate,
@@ -95,13 +96,13 @@ class Train:
       firenet train -o run
       firenet train -o run --images coco/train2017 --steps 100000
       firenet simulate -o set --sequences 1000  and then  firenet train -o run --data set
-      firenet train -o tuned --weights firenet.npz --learning-rate 1e-4
+      firenet train -o tuned --weights built-in --learning-rate 1e-4
     """
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder of the run; an interrupted run in it goes on."""
     weights: Annotated[Path | None, tyro.conf.arg(aliases=["-c"])] = None
-    """Start from these weights instead of random ones."""
+    """Start from these weights instead of random ones; built-in: those of the package."""
     data: Path | None = None
     """Folder of HDF5 sequences to train on (`firenet simulate`, or downloaded) instead of
     simulating as it goes; settings of textures, renderings, scenes and sensors play no part."""
@@ -126,6 +127,10 @@ class Train:
     motion: tuple[float, float] = (1.25, 2.5)
     """Pixels by which the fastest point moves in a window, at most one for a rendering; drawn
     log-uniformly for a sequence."""
+    slow: float = 0.0
+    """Part of the sequences in which next to nothing moves, most of them with next to no noise."""
+    swift: float = 0.0
+    """Part of the sequences in which 16 to 90 pixels pass in a window, before a blank ground."""
     learning_rate: float = 1e-3
     """Greatest rate, after warming up; it then falls to a hundredth along a cosine."""
     warmup: int = 200
@@ -138,7 +143,7 @@ class Train:
     seed: int = 0
     """Of the first parameters, the textures and all sequences."""
     bfloat16: bool = False
-    """Convolutions in bfloat16."""
+    """Convolutions in bfloat16: for accelerators; on a CPU it is slower."""
     remat: bool = False
     """Compute convolutions again for the gradient: less memory, a little more time."""
     log_every: int = 20
@@ -187,6 +192,7 @@ class Train:
                 f"crop is {self.crop} pixels, but images smaller than {SMALLEST} cannot be judged"
             )
         check_range("motion", self.motion)
+        check_rare(self.slow, self.swift)
         check_seed(self.seed)
         if not self.save_every >= 0:
             raise ValueError(f"save_every is {self.save_every} seconds, but must be 0 or more")
@@ -281,6 +287,8 @@ def _setups(key: jax.Array, textures: jax.Array, settings: Train, chain: int):
         width=settings.crop,
         renderings=settings.renderings,
         motion=settings.motion,
+        slow=settings.slow,
+        swift=settings.swift,
         scene=settings.scene,
         sensor=settings.sensor,
     )
@@ -431,7 +439,8 @@ def run(settings: Train, stop: int | None = None) -> None:
     """Trains as the settings say, going on where an interrupted run stopped.
 
     stop: leave after so many steps, in the middle of the schedule.
-    Raises ValueError where the settings do not fit the folder, the weights or the devices.
+    Raises ValueError where the settings do not fit the folder, the weights or the devices, or
+    where another run writes into the folder.
     """
     join(settings.coordinator, settings.processes, settings.process)
     if settings.batch % jax.device_count():
@@ -443,7 +452,10 @@ def run(settings: Train, stop: int | None = None) -> None:
     _check_settings(folder, settings)
     state = initial_train_state(settings)
     options = ocp.CheckpointManagerOptions(max_to_keep=2)
-    with ocp.CheckpointManager((folder / "checkpoints").absolute(), options=options) as saved:
+    with (
+        locked(folder) if _first() else contextlib.nullcontext(),  # the others do not write
+        ocp.CheckpointManager((folder / "checkpoints").absolute(), options=options) as saved,
+    ):
         if saved.latest_step() is not None:
             state = saved.restore(saved.latest_step(), args=ocp.args.StandardRestore(state))
             logger.warning("%s: going on after step %d", folder, state.step)

@@ -18,7 +18,7 @@ import av
 import numpy as np
 from PIL import Image
 
-from firenet_jax.files import OutputError, alone, partial_name, writing
+from firenet_jax.files import OutputError, lock_file, partial_name, writing
 
 VIDEOS = (".mp4", ".gif")
 # What is no folder's name: a dot alone, as in out_0.35, does not make a file of it.
@@ -116,7 +116,7 @@ class FolderWriter:
         with writing(path):
             self.partial.mkdir(exist_ok=True)
             self.stamps = (self.partial / "timestamps.txt").open("a+", newline="")
-            alone(self.stamps, path)
+            lock_file(self.stamps, path)
             self.stamps.seek(0)
             kept = itertools.islice(self.stamps, done)
             self.stamps.truncate(sum(map(len, kept)))
@@ -162,7 +162,7 @@ class VideoWriter:
         self.count = 0
         with writing(path):
             self.held = self.partial.open("ab")
-            alone(self.held, path)
+            lock_file(self.held, path)
             self.container = av.open(str(self.partial), "w")
         self.stream = self.filter = None
 

@@ -17,8 +17,6 @@ def pytest_collection_modifyitems(config, items):
     for item in items:
         if "slow" in item.keywords and not config.getoption("--slow"):
             item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
-        if "gpu" in item.keywords and jax.default_backend() != "gpu":
-            item.add_marker(pytest.mark.skip(reason="needs a GPU"))
 
 
 def _folder(variable: str) -> Path:

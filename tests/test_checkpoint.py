@@ -64,7 +64,7 @@ def converted(monkeypatch):
     """Converts a state dict, wherever it comes from."""
 
     def from_tensors(tensors):
-        monkeypatch.setattr(checkpoint, "read_state_dict", lambda path: tensors)
+        monkeypatch.setattr(checkpoint, "read_state_dict", lambda path: dict(tensors))
         return convert("model.pth")
 
     return from_tensors
@@ -225,6 +225,7 @@ def test_weights_that_come_with_the_package():
     assert sum(leaf.size for leaf in jax.tree.leaves(weights.params)) == 37_777
     file = importlib.resources.files("firenet_jax") / "weights" / "firenet.npz"
     assert len(file.read_bytes()) < 1_000_000
+    jax.tree.map(np.testing.assert_array_equal, load_weights("built-in").params, weights.params)
 
 
 # ---- PyTorch
@@ -293,7 +294,7 @@ E2VID = {
         ),
         (
             state_dict(FIRENET) | {"net.pred.conv2d.bias": np.full(1, 1e300)},
-            "prediction/bias has values that are not finite",
+            "'net.pred.conv2d.bias' has values that are not finite",
         ),
     ],
 )

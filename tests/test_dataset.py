@@ -1,5 +1,6 @@
 import json
 import math
+import sys
 
 import av
 import h5py
@@ -11,7 +12,7 @@ from PIL import Image
 from firenet_jax import cli, dataset
 from firenet_jax.dataset import Picture, Simulate, read_clip, rounded_flow, run, write_sequence
 from firenet_jax.events import Events, concatenate
-from firenet_jax.files import OutputError
+from firenet_jax.files import OutputError, locked
 from firenet_jax.readers import open_recording
 from firenet_jax.scenes import SceneSettings
 from firenet_jax.sensor import EPS
@@ -250,6 +251,16 @@ def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, monkeypatch):
     assert not list(folder.rglob("*.partial*"))
     for name in ("train/000000.h5", "train/000001.h5", "validation/000000.h5"):
         assert same(folder / name, tmp_path / "whole" / name)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
+def test_what_another_run_is_writing_is_left_alone(tmp_path):
+    run(settings(tmp_path, sequences=1, validation=0))
+    partial = tmp_path / "train" / "000001.partial.h5"
+    partial.write_bytes(b"half of it")
+    with locked(tmp_path), pytest.raises(OutputError, match="another run is writing it"):
+        run(settings(tmp_path, sequences=2, validation=0))
+    assert partial.read_bytes() == b"half of it"
 
 
 def test_a_run_with_more_sequences_adds_the_others(tmp_path, capsys):

@@ -377,7 +377,7 @@ def loaded(monkeypatch):
     """Loads a state dict, wherever it comes from."""
 
     def from_tensors(tensors):
-        monkeypatch.setattr(e2vid, "read_state_dict", lambda path: tensors)
+        monkeypatch.setattr(e2vid, "read_state_dict", lambda path: dict(tensors))
         return load("model.pth")
 
     return from_tensors
@@ -449,9 +449,9 @@ def without(name, **kinds):
         ),
         (
             changed("head.conv2d.bias", np.full(1, np.nan, np.float32)),
-            "'unetrecurrent.head.conv2d' or .* has values that are not finite",
+            "'unetrecurrent.head.conv2d.bias' has values that are not finite",
         ),
-        (changed("head.conv2d.bias", np.full(1, 1e300)), "head.conv2d' or .* not finite"),
+        (changed("head.conv2d.bias", np.full(1, 1e300)), "head.conv2d.bias' has .* not finite"),
         (
             changed("pred.norm_layer.running_var", np.full(1, -1, np.float32)),
             "'unetrecurrent.pred.conv2d' or .* not finite",

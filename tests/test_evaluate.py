@@ -254,6 +254,26 @@ def test_other_settings_are_refused_by_name_and_replaced_when_told(folder, tmp_p
         run(settings(folder, tmp_path / "mine", **other))
 
 
+def test_pictures_of_other_settings_are_not_shown_beside_a_gap(folder, tmp_path, monkeypatch):
+    shared = {"data": (folder / "data" / "a.h5",), "methods": "hf,mr"}
+    run(settings(folder, tmp_path / "out", **shared))
+    real, shown = evaluate.evaluate, []
+
+    def without_mr(plan, method, *rest):
+        if method.name == "mr":
+            raise Gap("no time")
+        return real(plan, method, *rest)
+
+    def page(results, sequences):
+        shown.extend(sequences.values())
+        return ""
+
+    monkeypatch.setattr(evaluate, "evaluate", without_mr)
+    monkeypatch.setattr(evaluate.report, "page", page)
+    run(settings(folder, tmp_path / "out", overwrite=True, equalise="global", **shared))
+    assert [sequence.titles for sequence in shown] == [["frame", "hf"]]
+
+
 # ---- What counts
 
 

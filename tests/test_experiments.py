@@ -2,6 +2,7 @@
 
 import importlib.util
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -19,6 +20,8 @@ WEIGHTS = Path(fj.__file__).parent / "weights" / "firenet.npz"
 SMALL = {
     "bfloat16": f"{WEIGHTS} {{recording}} --windows 12",
     "colour_mosaic": "--windows 4",
+    "compare_losses": "{folder}/runs --steps 1 --only l1",
+    "compare_optimisers": "{folder}/runs --steps 1 --only 'muon, rate 3e-3'",
     "figure3_qualitative": "--seconds 0.2",
     "figure4_high_speed": "--seconds 0.1 --windows 4",
     "figure5_recurrence": "--seconds 0.2",
@@ -37,12 +40,11 @@ SMALL = {
     "voxelisation": "--events 10000 --runs 1 --repeats 1",
     "xla_vs_pytorch": "--quick --parts pipeline",
 }
-TRAIN = {"compare_losses", "compare_optimisers"}  # minutes, even for a step each
 SHARED = {"figures", "harness", "pytorch_firenet"}  # no scripts: what several import
 
 
 def test_no_script_is_forgotten():
-    assert {path.stem for path in EXPERIMENTS.glob("*.py")} == SMALL.keys() | TRAIN | SHARED
+    assert {path.stem for path in EXPERIMENTS.glob("*.py")} == SMALL.keys() | SHARED
 
 
 @pytest.mark.slow
@@ -58,7 +60,7 @@ def test_runs(name, tmp_path):
     recording = tmp_path / "recordings" / "random.txt"
     recording.parent.mkdir()
     write_recording(recording, 20_000, width=64, height=48)
-    arguments = SMALL[name].format(recording=recording, folder=recording.parent).split()
+    arguments = shlex.split(SMALL[name].format(recording=recording, folder=recording.parent))
     done = subprocess.run(
         [sys.executable, f"experiments/{name}.py", *arguments],
         cwd=tmp_path,

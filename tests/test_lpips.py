@@ -257,6 +257,12 @@ def test_other_floats(loaded, dtype):
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(weights))
 
 
+def test_a_prefix_of_all_names(loaded):
+    tensors = {f"module.{name}": value for name, value in backbone("alex").items()}
+    kernel, _ = loaded(tensors, linear("alex")).convolutions["features.3"]
+    assert kernel.shape == (5, 5, 64, 192)
+
+
 VGG = {
     "features.0.weight": np.zeros((64, 3, 3, 3), np.float32),
     "features.2.weight": np.zeros((64, 64, 3, 3), np.float32),

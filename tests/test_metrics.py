@@ -73,12 +73,10 @@ def test_equals_the_obvious_version(name):
 
 
 @pytest.mark.parametrize("shape", [(11, 11), (96, 96), (180, 240)])
-def test_ssim_and_its_map_equal_scikit_image(shape):
+def test_ssim_equals_scikit_image(shape):
     truth = texture(5, *shape)
     image = truth + 0.1 * texture(6, *shape) + np.linspace(0, 0.5, shape[1], dtype=np.float32)
-    expected, expected_map = references.ssim(image, truth, full=True)
-    np.testing.assert_allclose(metrics.ssim(image, truth), expected, atol=1e-5)
-    np.testing.assert_allclose(metrics.ssim_map(image, truth), expected_map, atol=1e-4)
+    np.testing.assert_allclose(metrics.ssim(image, truth), references.ssim(image, truth), atol=1e-5)
 
 
 @pytest.mark.parametrize("sigma, data_range", [(1.5, 255.0), (0.8, 1.0), (2.5, 2.0)])

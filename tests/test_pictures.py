@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 import references
 
+from firenet_jax.events import Events
 from firenet_jax.pictures import (
     Display,
     bilateral,
@@ -11,6 +12,7 @@ from firenet_jax.pictures import (
     initial_display_state,
     unsharp_mask,
 )
+from firenet_jax.tensors import pack, voxelise
 
 
 def test_unsharp_mask_equals_the_5x5_kernel():
@@ -81,3 +83,18 @@ def test_event_pictures_show_the_sign_of_the_votes():
     pictures = np.asarray(event_pictures(tensor))
     assert pictures[0, 0].tolist() == [0, 0, 255] and pictures[1, 2].tolist() == [255, 0, 0]
     assert (pictures == 255).all(-1).sum() == 4
+
+
+def test_event_pictures_are_white_where_events_cancel():
+    """The votes of ON and OFF events then sum to 0 but for rounding."""
+    rng, count, width = np.random.default_rng(3), 8000, 2000
+    t, pixel, p = (
+        np.sort(rng.integers(0, 99_991, count)),
+        *rng.integers(0, [[width], [2]], (2, count)),
+    )
+    events = Events.of(t, pixel, np.zeros(count, int), p)
+    tensors = voxelise(pack([[events]]), height=1, width=width)
+    cancel = np.bincount(pixel, 2 * p - 1, width) == 0
+    assert np.asarray(tensors.sum(-1)).ravel()[cancel].any()
+    pictures = np.asarray(event_pictures(tensors))[0, 0, 0]
+    np.testing.assert_array_equal((pictures == 255).all(-1), cancel)

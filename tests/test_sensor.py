@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import jax
@@ -298,60 +299,52 @@ def test_leaks_are_on_events_at_their_rate_and_not_all_at_once():
     assert counts.max() < 1.6 * counts.mean()
 
 
-def noise_alone(level, expected, count=20_000, seed=0):
-    """Draws of one pixel's noise: which fired, their polarities, and their places in [0, 1)."""
-    numbers = jnp.full((count,), expected), jnp.full((count,), level)
-    run = module._shot_noise(jax.random.key(seed), *numbers, jnp.int32(1000 * TICKS))
-    fired = np.asarray(run.count) > 0
-    return fired, np.asarray(run.polarity)[fired], np.asarray(run.first)[fired] / (1000 * TICKS)
+def noisy_sensor(rate, on=0.2, off=0.17):
+    phase = jax.random.uniform(jax.random.key(1), (H, W))
+    return plain_sensor(on, off)._replace(noise=jnp.float32(rate), phase=phase)
 
 
-@pytest.mark.parametrize("expected", [0.03, 0.6])
-@pytest.mark.parametrize("level", [-1.0, -0.5, 0.0, 0.8, 1.0, 1.7])
-def test_shot_noise_has_its_rate_any_time_and_the_polarity_that_is_near(level, expected):
+def test_shot_noise_has_its_rate_and_no_order():
     """0.6 events an interval: a Poisson process' chance of one or more would be 0.45."""
-    fired, polarity, place = noise_alone(level, expected)
-    assert abs(fired.mean() - expected) < 4 * np.sqrt(expected / len(fired))
-    assert abs((polarity > 0).mean() - min((1 + level) / 2, 1)) < 4 * 0.5 / np.sqrt(len(place))
-    for sign in (-1, 1):
-        here = place[polarity == sign]
-        if len(here):
-            assert here.min() >= 0 and here.max() < 1
-            spread = np.histogram(here, 5, (0, 1))[0] / len(here)
-            assert abs(spread - 0.2).max() < 4 * 0.4 / np.sqrt(len(here))
+    ticks, polarity = jnp.int32(1000 * TICKS), jnp.ones(20_000)
+    for expected in (0.0, 0.03, 0.6, 1.3):
+        run = module._shot_noise(jax.random.key(2), expected * polarity, polarity, ticks)
+        fired = np.asarray(run.count)
+        assert abs(fired.mean() - min(expected, 1)) <= 4 * np.sqrt(expected / len(fired))
+        place = np.asarray(run.first)[fired > 0] / (1000 * TICKS)
+        spread = np.histogram(place, 5, (0, 1))[0]  # histogram leaves out what is outside
+        assert spread.sum() == fired.sum() and spread.std() <= 0.1 * spread.mean()
 
 
 def test_shot_noise_falls_with_light_to_a_quarter():
-    """Scenes at rest in the dark, in half light and in full light, 6 events per second in the dark;
-    what fires back is in the other run."""
-    for light, rate in ((0.0, 6.0), (0.5, 3.75), (1.0, 1.5)):
-        sensor = plain_sensor()._replace(noise=jnp.float32(6.0))
-        image = jnp.full((90, 100), light)
-        state, noise, back = module.first_state(sensor, image), 0, 0
-        step = jax.jit(module.step)
-        for _ in range(20):  # of 10 ms
-            state, runs = step(sensor, state, image, jnp.int32(10_000))
-            noise, back = noise + int(runs[1].count.sum()), back + int(runs[0].count.sum())
-        assert noise == pytest.approx(0.2 * rate * image.size, abs=4 * np.sqrt(0.2 * rate * 9000))
-        assert 0.3 * noise < back < noise
+    for light, rate in ((0.0, 60.0), (0.5, 37.5), (1.0, 15.0)):
+        times = np.arange(0, 500_001, 10_000)
+        images = np.full((len(times), H, W), light, np.float32)
+        chunks = event_list(noisy_sensor(60.0), zip(times, images, strict=True))
+        expected = 0.5 * rate * H * W
+        assert abs(sum(map(len, chunks)) - expected) < 4 * np.sqrt(expected)
 
 
-def test_shot_noise_is_taken_back_and_never_adds_up():
-    """The reference follows what fired, so the events of a pixel keep saying where L is: never off
-    by more than the two thresholds, whatever L does. At rest most events have another polarity than
-    the pixel's last, where drawn ones would have half of the time."""
+@pytest.mark.parametrize("on, off", [(0.2, 0.2), (0.2, 0.17), (0.1, 0.3)])
+def test_shot_noise_alternates_and_never_adds_up(on, off):
+    """The reference follows what fires, so the events of a pixel say where L is, to within the
+    thresholds, whatever L does. At rest ON and OFF say as much, and alternate where thresholds are
+    alike; that of whether a pixel begins with ON or OFF decides its phase."""
     times = np.arange(0, 2_000_001, 10_000)
     for logs in (random_logs(7, times), np.full((len(times), H, W), -2.0)):
-        events = listed(plain_sensor()._replace(noise=jnp.float32(20.0)), times, logs)
-        assert np.all(np.diff(events.t) >= 0)
+        sensor = noisy_sensor(20.0, on, off)
+        events = listed(sensor, times, logs)
+        assert np.all(np.diff(events.t) >= 0) and len(events) > 5000
         said = np.zeros((len(times), H, W))
-        change = np.where(events.p, 0.2, -0.17)
+        change = np.where(events.p, on, -off)
         np.add.at(said, (np.searchsorted(times, events.t), events.y, events.x), change)
-        error = logs - logs[0] - np.cumsum(said, 0)
-        assert error.max() <= 0.2 + 0.17 + 1e-3 and error.min() >= -0.2 - 0.17 - 1e-3
+        begun = np.asarray((on + off) * sensor.phase - off)
+        above = logs - logs[0] - np.cumsum(said, 0) + begun
+        assert above.min() >= -off - 1e-3 and above.max() <= on + 1e-3
     signs = [at_pixel(events, y, x)[1] for y in range(H) for x in range(W)]
-    same = np.concatenate([np.diff(p) == 0 for p in signs])
-    assert len(events) > 2000 and same.mean() < 0.35
+    same = np.concatenate([np.diff(p) == 0 for p in signs]).mean()
+    assert same == pytest.approx(abs(on - off) / (on + off), abs=0.03)
+    assert np.mean([p[0] > 0 for p in signs]) == pytest.approx(off / (on + off), abs=0.15)
 
 
 def test_hot_pixels_are_few_and_fire_all_the_time():
@@ -541,6 +534,24 @@ def test_random_sequences_have_the_declared_shapes_and_do_not_retrace(textures):
     assert made.images.min() >= 0 and made.images.max() <= 1
     with pytest.raises(ValueError, match="6 renderings"):
         sequences(jax.random.key(0), textures, **(SETTINGS | dict(motion=(1.0, 6.0))))
+
+
+def test_rare_sequences_are_slow_and_calm_or_swift_before_a_blank_ground(textures):
+    settings = SETTINGS | {"batch": 96, "sensor": replace(FAULTY, noise=(1.0, 1.0))}
+    make = partial(module.random_setups, jax.random.key(3), textures, **settings)
+    sensors, scenes, bounds = make(slow=0.3, swift=0.2)
+    pixels = np.asarray(1e-6 * (bounds[1] - bounds[0]) * scenes.speed)
+    slow, swift = pixels < 0.31, pixels > 15.9
+    assert 0.15 < slow.mean() < 0.45 and 0.08 < swift.mean() < 0.32
+    assert pixels.min() > 0.019 and pixels.max() < 90.1
+    usual = pixels[~slow & ~swift]
+    assert usual.max() < 2.51  # or less: a window lasts 300 ms at most
+    blank = np.ptp(np.asarray(scenes.textures[0]).reshape(96, -1), axis=1) == 0
+    np.testing.assert_array_equal(blank, swift)
+    calm = np.asarray(sensors.noise) < 0.5
+    assert not calm[~slow].any() and 0.4 < calm[slow].mean() < 0.9
+    with pytest.raises(ValueError, match="together less than 1"):
+        make(slow=0.6, swift=0.4)
 
 
 @pytest.mark.slow

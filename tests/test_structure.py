@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from test_pipeline import write_recording
 
 import firenet_jax as fj
 
@@ -92,10 +93,21 @@ def test_every_module_opens_with_what_flows_through_it():
 
 def test_public_names_exist_have_docstrings_and_are_no_modules():
     for name in fj.__all__:
-        assert getattr(fj, name).__doc__, name
+        doc = getattr(fj, name).__doc__
+        assert doc and not doc.startswith(f"{name}("), name  # that is what a dataclass makes
         assert not (PACKAGE / f"{name}.py").exists(), f"importing fj.{name} would hide it"
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         fj.nonsense  # noqa: B018
+
+
+def test_the_example_of_the_package_runs(tmp_path, monkeypatch):
+    example = [line[4:] for line in fj.__doc__.splitlines() if line.startswith("    ")]
+    monkeypatch.chdir(tmp_path)
+    write_recording(tmp_path / "dynamic_6dof.txt", 2000, width=24, height=18)
+    names = {}
+    code = "\n".join(example[example.index("import firenet_jax as fj") :])
+    exec(code.replace(".zip", ".txt"), names)
+    assert names["images"].shape == (len(names["times"]), 1, 18, 24)
 
 
 @pytest.mark.parametrize("command", ["import firenet_jax", "cli.main(['--help'])"])

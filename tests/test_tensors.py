@@ -142,8 +142,15 @@ def test_capacities_only_grow_and_are_few():
     assert capacity(CAPACITIES[1] + 1) == CAPACITIES[2]
     assert capacity(1, at_least=CAPACITIES[3]) == CAPACITIES[3]
     assert capacity(CAPACITIES[-1] + 1) == 2 * CAPACITIES[-1]
+    assert capacity(2**23 + 1) == 2**24  # memory counts there, so not 8 times as many
     with pytest.raises(ValueError, match="do not fit"):
         pack([[random_events(np.random.default_rng(0), 10)]], size=9)
+
+
+@pytest.mark.parametrize("rows", [[], [[]], [[Events.empty()], [Events.empty()] * 2]])
+def test_what_is_no_table_of_windows_is_refused(rows):
+    with pytest.raises(ValueError, match="T rows of B windows each"):
+        pack(rows)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks")

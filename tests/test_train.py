@@ -1,6 +1,7 @@
 import itertools
 import json
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from firenet_jax import train
 from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.dataset import Picture, write_sequence
 from firenet_jax.events import Events
+from firenet_jax.files import locked
 from firenet_jax.losses import Loss
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.scenes import SceneSettings
@@ -175,6 +177,14 @@ def test_other_settings_do_not_continue_a_run(tmp_path):
     train._check_settings(tmp_path, tiny(tmp_path, log_every=7, save_every=60.0, validate_every=4))
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
+def test_a_run_that_is_still_going_on_is_left_alone(tmp_path):
+    (tmp_path / "log.jsonl").write_text('{"step": 5}\n')
+    with locked(tmp_path), pytest.raises(ValueError, match="another run is writing it"):
+        run(tiny(tmp_path))
+    assert (tmp_path / "log.jsonl").read_text() == '{"step": 5}\n'
+
+
 def test_an_output_that_is_a_file(tmp_path):
     (tmp_path / "taken").write_text("mine")
     with pytest.raises(ValueError, match="taken is a file, but a run needs a folder"):
@@ -265,6 +275,7 @@ def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypa
         ({"warmup": 6}, "warmup"), ({"warmup": -5}, "warmup"),
         ({"log_every": 0}, "log_every"), ({"validate_every": 0}, "validate_every"),
         ({"crop": 10}, "smaller than 11"), ({"procedural": 3.0}, "procedural"),
+        ({"slow": 0.5, "swift": 0.5}, "slow is 0.5 and swift is 0.5"),
         ({"motion": (0.0, 2.0)}, "motion is 0 2"), ({"motion": (2.0, 1.0)}, "the least first"),
         ({"seed": -3}, "seed is -3"), ({"seed": 5_000_000_000}, "less than 2"),
     ],

@@ -12,6 +12,7 @@ when it is read: it is the same function with one layer fewer.
 import itertools
 import math
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ import numpy as np
 from flax.traverse_util import unflatten_dict
 
 from firenet_jax.network import BINS, ResidualBlock
-from firenet_jax.pytorch_file import CheckpointError, read_state_dict
+from firenet_jax.pytorch_file import CheckpointError, identify, read_state_dict, refuse_unused, take
 from firenet_jax.reconstruction import padding
 
 STRIDE = 8  # of the three encoders together
@@ -241,77 +242,43 @@ def load(path: str | Path, *, sigmoid: bool = True) -> tuple[dict, Settings]:
     """
     path = Path(path)
     tensors = read_state_dict(path)
-    prefix = _prefix(path, tensors)
+    _, prefix = identify(tensors, {"E2VID": FIRST}, path, "E2VID", TRY)
     first = tensors[prefix + FIRST]
     settings = Settings(
         transposed=f"{prefix}decoders.0.transposed_conv2d.weight" in tensors,
         sigmoid=sigmoid,
         channels=first.shape[1] if first.ndim == 4 else Settings.channels,
     )
-    used = set()
-
-    def take(name: str, shape: tuple[int, ...]) -> np.ndarray:
-        name = prefix + name
-        if name not in tensors:
-            raise CheckpointError(f"{path} holds no E2VID: {name!a} is missing; {TRY}")
-        found = tensors[name]
-        if found.shape != shape or found.dtype.kind != "f":
-            raise CheckpointError(
-                f"{path} holds no E2VID: {name!a} should be floats {shape} and is "
-                f"{found.dtype} {found.shape}; {TRY}"
-            )
-        used.add(name)
-        return found.astype(np.float64)
+    ours = partial(take, tensors, prefix, path, "E2VID", TRY)
 
     flat = {}
     for layer in _layers(settings):
         rows, columns, inputs, outputs = layer.shape
         if layer.transposed:
             # PyTorch scatters with this kernel, which is to gather with it turned by 180 degrees.
-            kernel = take(f"{layer.pytorch}.weight", (inputs, outputs, rows, columns))
+            kernel = ours(f"{layer.pytorch}.weight", (inputs, outputs, rows, columns))
             kernel = kernel.transpose(2, 3, 0, 1)[::-1, ::-1]
         else:
-            kernel = take(f"{layer.pytorch}.weight", (outputs, inputs, rows, columns))
+            kernel = ours(f"{layer.pytorch}.weight", (outputs, inputs, rows, columns))
             kernel = kernel.transpose(2, 3, 1, 0)
         if layer.norm and f"{prefix}{layer.norm}.running_mean" in tensors:
             mean, variance, weight, shift = (
-                take(f"{layer.norm}.{part}", (outputs,))
+                ours(f"{layer.norm}.{part}", (outputs,)).astype(np.float64)
                 for part in ("running_mean", "running_var", "weight", "bias")
             )
-            used.add(f"{prefix}{layer.norm}.num_batches_tracked")
-            with np.errstate(all="ignore"):  # a negative variance: refused below
+            tensors.pop(f"{prefix}{layer.norm}.num_batches_tracked", None)
+            with np.errstate(all="ignore"):  # a negative variance, or beyond float32: refused here
                 gain = weight / np.sqrt(variance + EPSILON)
-                kernel, bias = kernel * gain, shift - mean * gain
+                kernel = (kernel * gain).astype(np.float32)
+                bias = (shift - mean * gain).astype(np.float32)
+            if not (np.isfinite(kernel).all() and np.isfinite(bias).all()):
+                raise CheckpointError(
+                    f"{path} holds no E2VID: {prefix + layer.pytorch!a} or the normalisation after "
+                    f"it has values that are not finite; {TRY}"
+                )
         else:
-            bias = take(f"{layer.pytorch}.bias", (outputs,))
-        with np.errstate(over="ignore"):  # beyond float32: becomes inf and is refused
-            kernel, bias = kernel.astype(np.float32), bias.astype(np.float32)
-        if not (np.isfinite(kernel).all() and np.isfinite(bias).all()):
-            raise CheckpointError(
-                f"{path} holds no E2VID: {prefix + layer.pytorch!a} or the normalisation after it "
-                f"has values that are not finite; {TRY}"
-            )
+            bias = ours(f"{layer.pytorch}.bias", (outputs,))
         flat[f"{layer.name}/kernel"], flat[f"{layer.name}/bias"] = kernel, bias
 
-    for name in tensors:  # a layer that we would leave out: the images would be quietly wrong
-        if name.startswith(prefix) and name not in used:
-            raise CheckpointError(f"{path} holds no E2VID: E2VID has no place for {name!a}; {TRY}")
+    refuse_unused(tensors, prefix, path, "E2VID", TRY)
     return unflatten_dict(flat, sep="/"), settings
-
-
-def _prefix(path: Path, tensors: dict[str, np.ndarray]) -> str:
-    """What stands before the names of the network: unetrecurrent. where it is published."""
-    found = [
-        name.removesuffix(FIRST) for name in tensors if name == FIRST or name.endswith("." + FIRST)
-    ]
-    if not found:
-        raise CheckpointError(
-            f"{path} holds no E2VID: expected {FIRST}, found {len(tensors)} other names, "
-            f"the first {next(iter(tensors))!a}; {TRY}"
-        )
-    if len(found) > 1:
-        raise CheckpointError(
-            f"{path} holds several networks ({', '.join(repr(prefix) for prefix in found)}); "
-            "save one of them alone"
-        )
-    return found[0]
