@@ -10,8 +10,8 @@ then windows in which next to nothing moves, as in most recordings; then a sharp
 mostly clean sensors again; then a loss that sees faint structure and flicker; then objects before
 blank grounds, uneven thresholds and what passes within one window, to teach it to forget what has
 passed; then the usual motion and faults again; then other pictures, most of them photographs of
-everyday things; at last rare motion, much slower and much faster, and noise that moves the pixels'
-references as that of real sensors does. Each was a lesson of the one before.
+everyday things; at last rare motion, much slower and much faster, and noise that alternates as that
+of real sensors does. Each was a lesson of the one before.
 
 PICTURES were 63: scikit-image's own (`textures.PHOTOGRAPHS`), matplotlib's sample data, and those
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
@@ -31,8 +31,8 @@ picture of `textures.HELD_OUT` was among any of them.
 
 Built in is RUN/weights.npz: a mean of the last weights of stages (Wortsman et al., "Model soups",
 ICML 2022), preferred to the last alone by the sequences of shipped_weights.py; so are the means
-from which the last stages began. Up to "rests" shot noise drew its signs and did not move the
-pixels' references, and for the first 1,200 steps of "noise" it was taken back at once.
+from which the last stages began. Up to "rests" shot noise drew its signs; in "noise" it moved the
+reference of L, so that it mostly alternated; now it alternates.
 
 The report is written to results/train_default.json, the curve to results/train_default.png. Stages
 that are not in RUN, because they ran elsewhere, keep what was reported of them.
@@ -228,7 +228,7 @@ TAILS = replace(
 )
 # More of both: the trail went, and with it faint areas.
 RESTS = replace(TAILS, steps=1800, slow=0.2, swift=0.13, learning_rate=1.3e-3, seed=61)
-# Noise that moves the references alternates, so that single events which do not can be trusted.
+# Noise that alternates, so that single events which do not can be trusted.
 NOISE = replace(
     TAILS,
     steps=2000,

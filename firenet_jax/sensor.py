@@ -5,7 +5,7 @@ event tensors that never leave the device. Both call `step` for each rendering o
 
     L = log(0.001 + I);  a pixel emits an event, p = +1 or -1, each time L, taken as linear between
     two renderings, crosses reference + p C_p; the reference moves by p C_p, also when the
-    refractory period swallows the event. Shot noise fires, and moves the reference, without L.
+    refractory period swallows the event. Shot noise fires ON and OFF in turn, whatever L does.
 
 (Rebecq et al., "ESIM: an open event camera simulator", CoRL 2018.) L being linear, the events of a
 pixel between two renderings are equally spaced, and so are those that the refractory period
@@ -76,9 +76,9 @@ class SensorSettings:
     mismatch: float | None = None
     """Standard deviation of each pixel's own thresholds, in log intensity; about 0.03 in life."""
     noise: tuple[float, float] | None = None
-    """Shot noise: events per second of a pixel in the dark, where L need not change; in full light
-    there are a quarter as many. They move the reference too, so ON and OFF alternate. At most one
-    of a pixel between two renderings."""
+    """Shot noise: events per second of a pixel in the dark; in full light a quarter as many. They
+    are ON and OFF in turn, since what noise adds it takes away again. At most one of a pixel
+    between two renderings."""
     leak: tuple[float, float] | None = None
     """ON events per second by which every pixel's reference drifts, about 0.1 in sensors."""
     hot: tuple[float, float] | None = None
@@ -149,8 +149,8 @@ class Sensor(NamedTuple):
     drift: jax.Array | None  # (H, W) log intensity per second, by which L seems to rise
     noise: jax.Array | None  # () events per second and pixel in the dark
     cutoff: jax.Array | None  # (2,) hertz in full light, and the part of it left in the dark
-    phase: jax.Array | None  # (H, W) in [0, 1), where a pixel begins on its way to a threshold, if
-    # L drifts, or between both, if there is noise: else all would begin with the same event
+    phase: jax.Array | None  # (H, W) part of the first threshold already gone, where L drifts, and
+    # whether noise begins with ON: else all pixels would begin with the same event
     key: jax.Array  # of the noise
 
 
@@ -160,6 +160,7 @@ class SensorState(NamedTuple):
     log: jax.Array  # (H, W) float32, L after the low-pass
     above: jax.Array  # (H, W) float32, L above the reference: small, so no rounding adds up
     silent: jax.Array | None  # (H, W) int32, ticks until the refractory period is over
+    noise_on: jax.Array | None  # (H, W) bool, whether noise fires ON next
     renderings: jax.Array  # () int32, how many so far: they number the noise
 
 
@@ -235,16 +236,15 @@ def log_intensity(image: jax.Array) -> jax.Array:
 
 
 def first_state(sensor: Sensor, image: jax.Array) -> SensorState:
-    """The first rendering (H, W) sets every pixel's reference, which noise has moved already."""
+    """The first rendering (H, W) sets every pixel's reference."""
     log = log_intensity(image)
     above = jnp.zeros_like(log)
-    if sensor.noise is not None:
-        above = (sensor.on + sensor.off) * sensor.phase - sensor.off
-    elif sensor.drift is not None:
+    if sensor.drift is not None:
         drifted = jnp.where(sensor.drift > 0, sensor.on, -sensor.off) * sensor.phase
         above = jnp.where(sensor.drift != 0, drifted, above)
     silent = None if sensor.refractory is None else jnp.zeros(image.shape, jnp.int32)
-    return SensorState(log, above, silent, jnp.int32(0))
+    noise_on = None if sensor.noise is None else sensor.phase * 1024 % 2 < 1
+    return SensorState(log, above, silent, noise_on, jnp.int32(0))
 
 
 def step(
@@ -286,16 +286,14 @@ def step(
     if sensor.refractory is not None:
         run, silent = _refractory(run, state.silent, sensor.refractory, ticks)
 
-    runs = (run,)
+    runs, noise_on = (run,), state.noise_on
     if sensor.noise is not None:
         key = jax.random.fold_in(sensor.key, state.renderings)
-        # Towards the threshold from which the reference stays between both: that is one of the two.
-        up = above > sensor.on - sensor.off
         expected = seconds * sensor.noise * (1 - 0.75 * image)
-        noise = _shot_noise(key, expected, jnp.where(up, 1.0, -1.0), ticks)
-        above = above - noise.count * jnp.where(up, sensor.on, -sensor.off)
+        noise = _shot_noise(key, expected, jnp.where(noise_on, 1.0, -1.0), ticks)
+        noise_on = noise_on ^ (noise.count > 0)
         runs += (noise,)
-    return SensorState(after, above, silent, state.renderings + 1), runs
+    return SensorState(after, above, silent, noise_on, state.renderings + 1), runs
 
 
 def _refractory(run: Run, silent: jax.Array, refractory: jax.Array, ticks: jax.Array):
@@ -321,9 +319,10 @@ def _refractory(run: Run, silent: jax.Array, refractory: jax.Array, ticks: jax.A
 def _shot_noise(key: jax.Array, expected: jax.Array, polarity: jax.Array, ticks: jax.Array) -> Run:
     """At most one event a pixel and interval, at any time in it; expected: (H, W) events.
 
-    Its rate falls with light, and the reference follows, as in Hu, Liu and Delbruck, "v2e", CVPRW
-    2021; but it does not wait for the refractory period. One random number decides all: where it is
-    below the probability, it is uniform below it.
+    Its rate falls with light as in Hu, Liu and Delbruck, "v2e", CVPRW 2021. It moves a reference,
+    as there, but one of its own: were it that of L, its polarity would hang on the last bits of L,
+    and a batch on the devices that compute it. It does not wait for the refractory period. One
+    random number decides all: where it is below the probability, it is uniform below it.
     """
     # Not that of at least one event of a Poisson process, 1 - exp(-expected): as no interval has
     # more than one, the rate that was asked for would be missed by a quarter at 0.6.
