@@ -243,6 +243,7 @@ def first_state(sensor: Sensor, image: jax.Array) -> SensorState:
         drifted = jnp.where(sensor.drift > 0, sensor.on, -sensor.off) * sensor.phase
         above = jnp.where(sensor.drift != 0, drifted, above)
     silent = None if sensor.refractory is None else jnp.zeros(image.shape, jnp.int32)
+    # A later bit of the phase than those that say when a pixel leaks.
     noise_on = None if sensor.noise is None else sensor.phase * 1024 % 2 < 1
     return SensorState(log, above, silent, noise_on, jnp.int32(0))
 
