@@ -262,17 +262,16 @@ def run(settings: Simulate) -> list[Path]:
     OutputError or ValueError with a message of one sentence."""
     if settings.video is not None:
         return [simulate_clip(settings)]
-    parse_size(settings.sensor_size or "240x180")
+    height, width = parse_size(settings.sensor_size or "240x180")
     open_folder(settings)
     with locked(settings.output):
-        return write_sequences(settings)
+        return write_sequences(settings, height, width)
 
 
-def write_sequences(settings: Simulate) -> list[Path]:
+def write_sequences(settings: Simulate, height: int, width: int) -> list[Path]:
     """Writes those that are not in the folder yet."""
     for left in settings.output.glob("*/*.partial.h5"):  # of a run that was killed
         left.unlink()
-    height, width = parse_size(settings.sensor_size or "240x180")
     sensor = with_faults(settings.sensor) if settings.faults else settings.sensor
     record = describe(settings)
     held_out = settings.sequences // 20 if settings.validation is None else settings.validation

@@ -225,7 +225,7 @@ def run(settings: Evaluate) -> dict:
         raise RecordingError(f"nothing can be evaluated: {' / '.join(reason[0])}: {reason[1]}")
 
     results = summarise(settings, shared, plans, recordings, methods, done, gaps)
-    write_all(settings, results, plans, done)
+    write_all(settings, results, plans, [key for key in records if key in done])
     return results
 
 
@@ -566,7 +566,7 @@ def protocol(settings: Evaluate) -> list[str]:
     ]
 
 
-def write_all(settings: Evaluate, results: dict, plans: dict[str, Plan], done: dict) -> None:
+def write_all(settings: Evaluate, results: dict, plans: dict[str, Plan], done: list) -> None:
     """Prints the table; writes results.json, table.csv, the videos and index.html."""
     folder = settings.output
     write_text(folder / "results.json", json.dumps(results, indent=1, allow_nan=False))
@@ -577,7 +577,7 @@ def write_all(settings: Evaluate, results: dict, plans: dict[str, Plan], done: d
     print(f"\n{folder / 'index.html'}: the report; table.csv and results.json beside it")
 
 
-def show(settings: Evaluate, plan: Plan, done: dict) -> report.Shown:
+def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
     """The pictures of a sequence side by side, the frames first, and its video on disk.
 
     Only of what is done: what became a gap may have pictures of other settings on disk.
