@@ -7,6 +7,8 @@ Three parts, each in one run with the methods in turn:
     training  ten windows forward, loss, gradient, Adam; batch 2 at 96x96 and 128x128; and what
               part of our step, which simulates its data, the simulation takes
 
+"JAX in scan" is what `reconstruct` does: on a CPU, where it can, with the step as machine code
+(`firenet_jax/native.py`); "XLA in scan" is the same scan over the step that XLA compiles.
 PyTorch runs as the field's programs do (eager, NCHW, separate gates) and as it runs best: our fused
 gates, channels_last, torch.compile, frozen TorchScript, bfloat16, and CUDA graphs on a GPU. A
 step outside of a scan is PyTorch's only kind. Before anything is timed the float32 results are
@@ -18,7 +20,7 @@ float32 is float32 on a GPU too: TF32 is off on both sides.
     python experiments/xla_vs_pytorch.py --quick                        5 minutes; saves nothing
 
 A step is held against what direct convolutions cannot beat: their products at the rate of two large
-matrices' product ("its products alone").
+matrices' product ("its products alone"). Machine code has fewer products (Winograd).
 
 "first s" is the first call: compilation, if there is any, and one run. "peak MB" is by how much
 a fresh process grows while the method runs warm (on a GPU: what its framework holds at most).
@@ -180,6 +182,10 @@ def step_makers(width: int, height: int, batch: int) -> Makers:
         run = partial(reconstruct, weights, state, tensors, dtype=dtype)
         return lambda: jax.block_until_ready(run())[1][0]
 
+    def xla_scan():
+        run = jax.jit(partial(jax.lax.scan, partial(step, params)))
+        return lambda: jax.block_until_ready(run(state, tensors))[1][0]
+
     def torch_step(make, memory_format, dtype=torch.float32):
         model = make()
         inputs = [to_torch(x, memory_format).to(dtype) for x in (*state, tensors[0])]
@@ -200,6 +206,7 @@ def step_makers(width: int, height: int, batch: int) -> Makers:
     makers = {
         "JAX step": partial(jax_step, jnp.float32),
         "JAX in scan": partial(jax_scan, jnp.float32),
+        "XLA in scan": xla_scan,
         "JAX step, bfloat16": partial(jax_step, jnp.bfloat16),
         "JAX in scan, bfloat16": partial(jax_scan, jnp.bfloat16),
     }
@@ -447,7 +454,7 @@ def measure_step(options) -> dict:
         width, height = map(int, resolution.split("x"))
         cases += [(width, height, batch) for batch in BATCHES if batch <= 16 // less]
     cases = [cases[0]] if options.quick else cases
-    units = {"JAX in scan": IN_SCAN, "JAX in scan, bfloat16": IN_SCAN}
+    units = dict.fromkeys(["JAX in scan", "XLA in scan", "JAX in scan, bfloat16"], IN_SCAN)
     rate = products_per_second(options.runs)
     results = []
     for width, height, batch in cases:
@@ -513,6 +520,7 @@ COLOURS = {
     "JAX, chunk of 8": "tab:blue",
     "JAX": "tab:blue",
     "JAX in scan": "navy",
+    "XLA in scan": "cornflowerblue",
     "JAX, one by one": "lightskyblue",
     "JAX, bfloat16": "lightskyblue",
     "PyTorch NCHW, as peers": "tab:red",

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from firenet_jax import colour
+from firenet_jax import colour, native
 from firenet_jax.devices import BATCH, EVERYWHERE, TIME_BATCH, on_each_device
 from firenet_jax.network import BINS, State, Weights, initial_state, step
 from firenet_jax.pictures import (
@@ -60,17 +60,46 @@ def reconstruct(
     Raises ValueError where the shapes of state and tensors do not belong together.
     """
     _check_shapes(state, tensors)
-
-    def body(state, inputs):
-        tensor, *rest = inputs
-        # Here, not for all windows at once: sums would be rounded otherwise for each T.
-        tensor = normalise(tensor) if weights.normalise else tensor
-        new, image = step(weights.params, state, tensor, *rest, dtype=dtype)
-        return new if recurrent else state, image
-
     if not recurrent:
         state = jax.tree.map(jnp.zeros_like, state)
+    if dtype == jnp.float32 and native.supports(*tensors.shape[2:4]):
+        return _native(recurrent, weights, state, tensors, valid)
+    return _scan(
+        partial(step, weights.params, dtype=dtype), recurrent, weights, state, tensors, valid
+    )
+
+
+def _scan(step, recurrent: bool, weights: Weights, state: State, tensors, valid):
+    def body(state, inputs):
+        tensor, exists = inputs
+        # Here, not for all windows at once: sums would be rounded otherwise for each T.
+        tensor = normalise(tensor) if weights.normalise else tensor
+        new, image = step(state, tensor, exists)
+        return new if recurrent else state, image
+
     return jax.lax.scan(body, state, (tensors, valid))
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _native(recurrent, weights, state, tensors, valid):
+    """The same by the step that has no gradient; for one, everything is computed again by XLA."""
+    native_step = partial(native.step, native.pack(weights.params))
+    state, images = _scan(native_step, recurrent, weights, native.enclose(state), tensors, valid)
+    return native.interior(state, *tensors.shape[2:4]), images
+
+
+def _native_forward(recurrent, *inputs):
+    return _native(recurrent, *inputs), inputs
+
+
+def _native_backward(recurrent, inputs, cotangents):
+    def plain(weights, *rest):
+        return _scan(partial(step, weights.params), recurrent, weights, *rest)
+
+    return jax.vjp(plain, *inputs)[1](cotangents)
+
+
+_native.defvjp(_native_forward, _native_backward)
 
 
 def _check_shapes(state: State, tensors: jax.Array) -> None:

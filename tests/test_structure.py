@@ -25,9 +25,20 @@ LAYERS = [
         "warp",
         "equalise",
         "devices",
+        "machine_code",
     ],
-    ["video", "readers", "windows", "network", "metrics", "scenes", "textures", "lpips"],
-    ["filters", "tensors", "checkpoint", "losses"],
+    [
+        "video",
+        "readers",
+        "windows",
+        "network",
+        "metrics",
+        "scenes",
+        "textures",
+        "lpips",
+        "foreign_call",
+    ],
+    ["filters", "tensors", "checkpoint", "losses", "native"],
     ["reconstruction", "sensor"],
     ["baselines"],
     ["info", "pipeline", "dataset", "batches", "methods", "report"],
@@ -42,7 +53,7 @@ DOORS = {
     "av": {"video", "dataset"}, "h5py": {"readers", "dataset", "batches", "evaluate"},
     "pyarrow": {"readers"},
     "grain": {"batches"}, "faery": {"readers"}, "rosbags": {"readers"}, "hdf5plugin": {"readers"},
-    "skimage": {"equalise"},
+    "skimage": {"equalise"}, "llvmlite": {"machine_code"},
 }  # fmt: skip
 
 

@@ -1,0 +1,173 @@
+"""Stages of machine code, each in parts -> a function that XLA's programs call on a CPU.
+
+A stage is a function (pointers to all arrays, image of the batch, part). The parts of a stage may
+run at once and in any order, by as many of XLA's threads as come; a stage begins when the one
+before it is done. The arrays are XLA's (`jax.ffi`): none is copied, nothing waits for Python.
+"""
+
+import ctypes
+
+import jax
+
+from firenet_jax.machine_code import (
+    INT,
+    INT32,
+    NULL,
+    POINTER,
+    VOID,
+    Code,
+    Function,
+    Module,
+    address,
+    integer,
+    integer32,
+)
+
+# Places in the structures of XLA's foreign function interface, in bytes (jaxlib's
+# include/xla/ffi/api/c_api.h). XLA refuses a handler of a version whose places it has moved.
+API_VERSION = (0, 3)
+FRAME_EXTENSION, FRAME_API, FRAME_CONTEXT, FRAME_ARGUMENTS, FRAME_RESULTS = 8, 16, 24, 72, 112
+EXTENSION_TYPE, EXTENSION_METADATA, IS_METADATA = 8, 24, 1
+METADATA_MAJOR, METADATA_MINOR = 24, 28
+BUFFER_DATA, BUFFER_DIMENSIONS = 24, 40
+API_DESTROY_ERROR, API_SCHEDULE, API_THREADS = 64, 136, 144
+
+# A call's record on the heap: who still uses it, images, arrays; and for each stage, in cache lines
+# of their own, how many parts are taken and how many are done.
+USERS, IMAGES, ARRAYS, COUNTERS, COUNTER = 0, 8, 16, 128, 64
+
+
+def register(
+    name: str,
+    module: Module,
+    stages: list[Code],
+    parts: int,
+    arguments: int,
+    results: list[int],
+) -> None:
+    """Compiles the module and makes it known to XLA under this name.
+
+    stages: functions of the module, (pointer to pointers, int64 image, int64 part).
+    parts: of each stage, for each image of the batch: the first axis of argument 0.
+    arguments, results: how many arguments, and which results, the stages get pointers of.
+    Raises RuntimeError where XLA's interface has another version than this was written for.
+    """
+    work = _work(module, stages, parts)
+    _handler(module, work, len(stages), parts, arguments, results)
+    handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(address(module, "handler"))
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
+
+
+def _work(module: Module, stages: list[Code], parts: int) -> Code:
+    """work(record): takes parts of one stage after the other, until all are done.
+
+    Whoever comes too late finds no part left to take and touches nothing but the record.
+    """
+    f = Function(module, "work", [POINTER])
+    (record,) = f.arguments
+    all_parts = f.times(f.load(INT, record, IMAGES), parts)
+    for i, stage in enumerate(stages):
+        taken = f.at(record, COUNTERS + 2 * i * COUNTER)
+        done = f.at(taken, COUNTER)
+        take, run, rest, wait, after = (f.b.append_basic_block() for _ in range(5))
+        f.b.branch(take)
+
+        f.b.position_at_end(take)
+        part = f.b.atomic_rmw("add", taken, integer(1), "monotonic")
+        f.b.cbranch(f.less(part, all_parts), run, rest)
+
+        f.b.position_at_end(run)
+        image, part = f.b.sdiv(part, integer(parts)), f.b.srem(part, integer(parts))
+        f.b.call(stage, [f.at(record, ARRAYS), image, part])
+        f.b.atomic_rmw("add", done, integer(1), "release")
+        f.b.branch(take)
+
+        f.b.position_at_end(rest)
+        finished = f.b.load_atomic(done, "acquire", 8, typ=INT)
+        f.b.cbranch(f.less(finished, all_parts), wait, after)
+
+        f.b.position_at_end(wait)
+        f.b.call(f.external("sched_yield", INT32), [])
+        f.b.branch(rest)
+
+        f.b.position_at_end(after)
+    f.b.ret_void()
+    return f.function
+
+
+def _leave(f: Function, record) -> None:
+    """The last user of a record gives its memory back."""
+    users = f.b.atomic_rmw("sub", f.at(record, USERS), integer(1), "acq_rel")
+    with f.b.if_then(f.b.icmp_signed("==", users, integer(1))):
+        f.b.call(f.external("free", VOID, POINTER), [record])
+
+
+def _handler(module, work, stages: int, parts: int, arguments: int, results: list[int]) -> None:
+    """handler(frame): what XLA calls: asks XLA's threads for help, works itself, leaves."""
+    f = Function(module, "helper", [POINTER])
+    (record,) = f.arguments
+    f.b.call(work, [record])
+    _leave(f, record)
+    f.b.ret_void()
+    helper = f.function
+
+    f = Function(module, "handler", [POINTER], POINTER, public=True)
+    (frame,) = f.arguments
+    _answer_version(f, frame)
+    context, api = f.load(POINTER, frame, FRAME_CONTEXT), f.load(POINTER, frame, FRAME_API)
+
+    def structure(*values):
+        memory = f.local(8 * (2 + len(values)))
+        for i, value in enumerate((integer(16 + 8 * len(values)), NULL, *values)):
+            f.store(value, memory, 8 * i)
+        return memory
+
+    def succeeds(function: int, *values):
+        """Calls one of XLA's functions; forgets its error, if any."""
+        error = f.call_pointer(f.load(POINTER, api, function), structure(context, *values))
+        failed = f.b.icmp_unsigned("!=", error, NULL)
+        with f.b.if_then(failed):
+            f.call_pointer(f.load(POINTER, api, API_DESTROY_ERROR), structure(error))
+        return f.b.not_(failed)
+
+    inputs = f.load(POINTER, frame, FRAME_ARGUMENTS)
+    outputs = f.load(POINTER, frame, FRAME_RESULTS)
+    buffers = [f.load(POINTER, inputs, 8 * i) for i in range(arguments)]
+    buffers += [f.load(POINTER, outputs, 8 * i) for i in results]
+    images = f.load(INT, f.load(POINTER, buffers[0], BUFFER_DIMENSIONS))
+
+    number = f.local(8)
+    f.store(integer(1), number)
+    succeeds(API_THREADS, number)  # else XLA has no threads to share: one
+    threads = f.smaller(f.load(INT, number), f.times(images, parts))
+
+    size = COUNTERS + 2 * stages * COUNTER
+    record = f.b.call(f.external("malloc", POINTER, INT), [integer(size)])
+    f.loop(0, size // 8, lambda i, _: f.store(integer(0), record, f.times(i, 8)))
+    f.store(threads, record, USERS)
+    f.store(images, record, IMAGES)
+    for i, buffer in enumerate(buffers):
+        f.store(f.load(POINTER, buffer, BUFFER_DATA), record, ARRAYS + 8 * i)
+
+    def hire(i, _):
+        hired = succeeds(API_SCHEDULE, f.b.ptrtoint(helper, INT), record)
+        with f.b.if_then(f.b.not_(hired)):
+            _leave(f, record)
+
+    with f.b.if_then(f.less(1, threads)):
+        f.loop(1, threads, hire)
+    f.b.call(work, [record])
+    _leave(f, record)
+    f.b.ret(NULL)
+
+
+def _answer_version(f: Function, frame) -> None:
+    """XLA asks once, when the function is registered, by an extension of the frame."""
+    extension = f.load(POINTER, frame, FRAME_EXTENSION)
+    with f.b.if_then(f.b.icmp_unsigned("!=", extension, NULL)):
+        kind = f.load(INT32, extension, EXTENSION_TYPE)
+        with f.b.if_then(f.b.icmp_signed("==", kind, integer32(IS_METADATA))):
+            metadata = f.load(POINTER, extension, EXTENSION_METADATA)
+            for place, part in zip((METADATA_MAJOR, METADATA_MINOR), API_VERSION, strict=True):
+                f.store(integer32(part), metadata, place)
+            f.b.ret(NULL)

@@ -1,0 +1,192 @@
+"""Words for writing a function of machine code -> the function, compiled for this processor.
+
+`Function` writes LLVM's instructions (llvmlite): numbers that it adds or loads are values of the
+function that is being written. Pointers are moved by bytes. Vectors hold one float32 for each of 16
+channels; LLVM makes of them what the processor has.
+"""
+
+import sys
+from collections.abc import Callable
+
+import numpy as np
+from llvmlite import binding, ir
+
+LANES = 16
+INT, INT32, FLOAT, POINTER = ir.IntType(64), ir.IntType(32), ir.FloatType(), ir.PointerType()
+VECTOR, INTS = ir.VectorType(FLOAT, LANES), ir.VectorType(INT32, LANES)
+VECTOR_BYTES = 4 * LANES
+ALIGNED = {VECTOR: VECTOR_BYTES, POINTER: 8, INT: 8, INT32: 4, FLOAT: 4}
+
+VOID, NULL = ir.VoidType(), ir.Constant(POINTER, None)
+Module, Code = ir.Module, ir.Function  # of LLVM
+# LLVM needs a function's type to call it; llvmlite has none for a pointer that was loaded.
+CALL_POINTER = """
+define ptr @call(ptr %function, ptr %argument) {
+  %result = call ptr %function(ptr %argument)
+  ret ptr %result
+}
+"""
+
+
+def integer(value) -> ir.Value:
+    return ir.Constant(INT, value) if isinstance(value, int) else value
+
+
+def integer32(value: int) -> ir.Constant:
+    return ir.Constant(INT32, value)
+
+
+def vector(value: float) -> ir.Constant:
+    return ir.Constant(VECTOR, [float(np.float32(value))] * LANES)
+
+
+class Function:
+    """A function that is being written; `b` (llvmlite's IRBuilder) is where the writing is."""
+
+    def __init__(self, module: Module, name: str, arguments: list, result=None, public=False):
+        signature = ir.FunctionType(result or VOID, arguments)
+        self.module, self.function = module, ir.Function(module, signature, name)
+        self.function.linkage = "" if public else "internal"
+        self.arguments = self.function.args
+        self.b = ir.IRBuilder(self.function.append_basic_block())
+
+    # Memory
+
+    def at(self, pointer, *byte_offsets):
+        for offset in byte_offsets:
+            pointer = self.b.gep(pointer, [integer(offset)], source_etype=ir.IntType(8))
+        return pointer
+
+    def load(self, kind, pointer, *byte_offsets):
+        return self.b.load(self.at(pointer, *byte_offsets), typ=kind, align=ALIGNED[kind])
+
+    def store(self, value, pointer, *byte_offsets):
+        self.b.store(value, self.at(pointer, *byte_offsets), align=ALIGNED[value.type])
+
+    def local(self, size: int):
+        """So many bytes that last until the function returns."""
+        with self.b.goto_entry_block():
+            memory = self.b.alloca(VECTOR, -(-size // VECTOR_BYTES))
+            memory.align = VECTOR_BYTES
+            return self.b.inttoptr(self.b.ptrtoint(memory, INT), POINTER)
+
+    # Whole numbers
+
+    def times(self, number, factor: int):
+        return self.b.mul(integer(number), integer(factor))
+
+    def less(self, a, b):
+        return self.b.icmp_signed("<", integer(a), integer(b))
+
+    def smaller(self, a, b):
+        return self.b.select(self.less(a, b), integer(a), integer(b))
+
+    # Control
+
+    def external(self, name: str, result, *arguments) -> Code:
+        """A function of the C library, of LLVM or of another module."""
+        known = self.module.globals.get(name)
+        return known or ir.Function(self.module, ir.FunctionType(result, arguments), name)
+
+    def call_pointer(self, function, argument):
+        return self.b.call(self.external("call", POINTER, POINTER, POINTER), [function, argument])
+
+    def loop(self, start, stop, body: Callable, carried: list | tuple = ()) -> list:
+        """body(i, carried) -> carried, for start <= i < stop, at least once."""
+        before, inside = self.b.block, self.b.append_basic_block()
+        self.b.branch(inside)
+        self.b.position_at_end(inside)
+        first = [integer(start), *carried]
+        phis = [self.b.phi(value.type) for value in first]
+        following = [self.b.add(phis[0], integer(1)), *(body(phis[0], phis[1:]) or [])]
+        for phi, value, again in zip(phis, first, following, strict=True):
+            phi.add_incoming(value, before)
+            phi.add_incoming(again, self.b.block)
+        after = self.b.append_basic_block()
+        self.b.cbranch(self.less(following[0], stop), inside, after)
+        self.b.position_at_end(after)
+        return following[1:]
+
+    # Vectors
+
+    def numbers(self, name: str, *arguments):
+        """One of LLVM's functions of numbers, for each lane."""
+        kinds = [VECTOR] * len(arguments)
+        return self.b.call(self.external(f"llvm.{name}.v{LANES}f32", VECTOR, *kinds), arguments)
+
+    def fma(self, a, b, c):
+        return self.numbers("fma", a, b, c)
+
+    def everywhere(self, number):
+        undefined = ir.Constant(VECTOR, ir.Undefined)
+        first = self.b.insert_element(undefined, number, integer32(0))
+        return self.b.shuffle_vector(first, undefined, ir.Constant(INTS, [0] * LANES))
+
+    def total(self, lanes, start):
+        name = f"llvm.vector.reduce.fadd.v{LANES}f32"
+        add = self.external(name, FLOAT, FLOAT, VECTOR)
+        return self.b.call(add, [start, lanes], fastmath=("reassoc",))
+
+    def larger(self, x, bound):
+        """Not a number stays so."""
+        return self.b.select(self.b.fcmp_ordered("<", x, bound), bound, x)
+
+    def relu(self, x):
+        return self.larger(x, vector(0))
+
+    def exp(self, x):
+        """2^n e^r, r between half of -ln 2 and of ln 2: a polynomial (expf of Moshier's Cephes)."""
+        x = self.larger(x, vector(-87))
+        x = self.b.select(self.b.fcmp_ordered(">", x, vector(88)), vector(88), x)
+        n = self.numbers("rint", self.b.fmul(x, vector(1.44269504088896341)))
+        r = self.fma(n, vector(2.12194440e-4), self.fma(n, vector(-0.693359375), x))
+        series = vector(1.9875691500e-4)
+        for term in (1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 0.5):
+            series = self.fma(series, r, vector(term))
+        series = self.fma(self.b.fmul(series, r), r, self.b.fadd(r, vector(1)))
+        exponent = self.b.shl(self.b.fptosi(n, INTS), ir.Constant(INTS, [23] * LANES))
+        return self.b.bitcast(self.b.add(self.b.bitcast(series, INTS), exponent), VECTOR)
+
+    def sigmoid(self, x):
+        """1 / (1 + e^-x). "arcp": by an estimate and a Newton step, a division takes longer."""
+        one = vector(1)
+        return self.b.fdiv(one, self.b.fadd(one, self.exp(self.b.fneg(x))), flags=("arcp",))
+
+    def tanh(self, x):
+        return self.fma(vector(2), self.sigmoid(self.b.fadd(x, x)), vector(-1))
+
+
+def vectors() -> int:
+    """How many vectors this processor's registers hold; 0 where nothing of this was tried."""
+    if not binding.get_process_triple().startswith("x86_64") or sys.platform != "linux":
+        return 0
+    features = binding.get_host_cpu_features()
+    if features.get("avx512f"):
+        return 32
+    return 8 if features.get("avx2") and features.get("fma") else 0  # each in two of 16
+
+
+_engines = []  # what was compiled stays for as long as the process
+
+
+def address(module: Module, name: str) -> int:
+    """Compiles a module; where its function is."""
+    binding.initialize_native_target()
+    binding.initialize_native_asmprinter()
+    module.triple = binding.get_process_triple()
+    compiled = binding.parse_assembly(str(module))
+    compiled.link_in(binding.parse_assembly(CALL_POINTER))
+    machine = binding.Target.from_triple(module.triple).create_target_machine(
+        cpu=binding.get_host_cpu_name(),
+        # Some processors have vectors of 512 bits of which LLVM would use only half.
+        features=binding.get_host_cpu_features().flatten() + ",-prefer-256-bit",
+        opt=2,
+    )
+    passes = binding.create_pass_builder(
+        machine, binding.create_pipeline_tuning_options(speed_level=1)
+    )
+    passes.getModulePassManager().run(compiled, passes)
+    engine = binding.create_mcjit_compiler(compiled, machine)
+    engine.finalize_object()
+    _engines.append(engine)
+    return engine.get_function_address(name)

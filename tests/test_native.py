@@ -1,0 +1,119 @@
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_network import random_run
+
+from firenet_jax import foreign_call, machine_code, native, network
+from firenet_jax.network import State, Weights, initial_state
+from firenet_jax.reconstruction import reconstruct
+
+pytestmark = pytest.mark.skipif(
+    not native.supports(8, 8), reason="no machine code for this processor"
+)
+
+
+def random_state(batch, height, width, seed=5):
+    keys = jax.random.split(jax.random.key(seed))
+    return State(*(jnp.tanh(jax.random.normal(k, (batch, height, width, 16))) for k in keys))
+
+
+def scanned(step, state, tensors, exists):
+    return jax.lax.scan(lambda state, inputs: step(state, *inputs), state, (tensors, exists))
+
+
+def both(params, state, tensors, exists):
+    """By XLA, and by machine code."""
+    height, width = tensors.shape[2:4]
+
+    def plain(state, tensor, exists):
+        return network.step(params, state, tensor, exists)
+
+    packed = native.pack(params)
+
+    def ours(state, tensor, exists):
+        return native.step(packed, state, tensor, exists)
+
+    expected = scanned(plain, state, tensors, exists)
+    after, images = scanned(ours, native.enclose(state), tensors, exists)
+    return expected, (native.interior(after, height, width), images)
+
+
+@pytest.mark.parametrize(
+    "height, width",
+    [(1, 1), (2, 2), (1, 5), (7, 2), (5, 9), (12, 24), (13, 25), (20, 53), (9, 346)],
+)
+def test_equals_the_step_of_the_network(height, width):
+    """Even and odd sides, one tile and many blocks of them; images that do not exist."""
+    params, tensors = random_run(steps=4, batch=3, height=height, width=width)
+    exists = jnp.array([[True, True, True], [True, False, True], [False] * 3, [True] * 3])
+    expected, found = both(params, random_state(3, height, width), tensors, exists)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), found, expected)
+
+
+def test_processors_with_vectors_of_256_bits(monkeypatch):
+    """The instructions of one run on all that have more."""
+    features = machine_code.binding.FeatureMap({"avx2": True, "fma": True})
+    monkeypatch.setattr(machine_code.binding, "get_host_cpu_name", lambda: "haswell")
+    monkeypatch.setattr(machine_code.binding, "get_host_cpu_features", lambda: features)
+    params, tensors = random_run(steps=2, batch=2, height=15, width=43)
+    exists = jnp.ones((2, 2), bool)
+    expected, found = both(params, random_state(2, 15, 43), tensors, exists)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), found, expected)
+
+
+def test_leaves_its_arguments_alone():
+    """States change in place, but only those that nobody else sees."""
+    params, tensors = random_run(steps=1, batch=1, height=11, width=14)
+    state = native.enclose(random_state(1, 11, 14))
+    before = jax.tree.map(np.array, state)
+    native.step(native.pack(params), state, tensors[0])
+    jax.tree.map(np.testing.assert_array_equal, state, before)
+
+
+def test_many_at_once_give_the_same_bits():
+    params, tensors = random_run(steps=5, batch=2, height=40, width=50)
+    weights = Weights(params, True)
+
+    def run(_):
+        return np.asarray(reconstruct(weights, initial_state(2, 40, 50), tensors)[1])
+
+    first = run(0)
+    with ThreadPoolExecutor(6) as pool:
+        for images in pool.map(run, range(60)):
+            np.testing.assert_array_equal(images, first)
+
+
+def test_runs_where_xla_has_one_thread():
+    script = (
+        "import jax.numpy as jnp, firenet_jax as fj\n"
+        "from firenet_jax import native\n"
+        "assert native.supports(30, 40)\n"
+        "images = fj.reconstruct(fj.load_weights(), fj.initial_state(1, 30, 40), "
+        "jnp.ones((50, 1, 30, 40, 5)))[1]\n"
+        "assert bool(jnp.isfinite(images).all())\n"
+    )
+    flags = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}
+    subprocess.run([sys.executable, "-c", script], env=os.environ | flags, check=True)
+
+
+def test_without_machine_code_xla_reconstructs(monkeypatch):
+    params, tensors = random_run(steps=3, batch=1, height=10, width=17)
+    expected = reconstruct(Weights(params, False), initial_state(1, 10, 17), tensors)
+    jax.clear_caches()
+    monkeypatch.setattr(native, "vectors", lambda: 0)
+    monkeypatch.setattr(native, "step", None)
+    found = reconstruct(Weights(params, False), initial_state(1, 10, 17), tensors)
+    jax.clear_caches()
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), found, expected)
+
+
+def test_another_version_of_the_interface_is_no_end(monkeypatch):
+    monkeypatch.setattr(foreign_call, "API_VERSION", (99, 0))
+    with pytest.warns(UserWarning, match="slower than it could be"):
+        assert not native.supports(6, 77)
