@@ -32,9 +32,9 @@ METADATA_MAJOR, METADATA_MINOR = 24, 28
 BUFFER_DATA, BUFFER_DIMENSIONS = 24, 40
 API_DESTROY_ERROR, API_SCHEDULE, API_THREADS = 64, 136, 144
 
-# A call's record on the heap: who still uses it, images, arrays; and for each stage, in cache lines
-# of their own, how many parts are taken and how many are done.
-USERS, IMAGES, ARRAYS, COUNTERS, COUNTER = 0, 8, 16, 128, 64
+# A call's record on the heap: how many may still use it, images, who has come, arrays; and for each
+# stage, in cache lines of their own, how many parts are done, and taken of each half.
+USERS, IMAGES, WORKERS, ARRAYS, COUNTERS, COUNTER = 0, 8, 16, 24, 128, 64
 
 
 def register(
@@ -61,26 +61,48 @@ def register(
 def _work(module: Module, stages: list[Code], parts: int) -> Code:
     """work(record): takes parts of one stage after the other, until all are done.
 
-    Whoever comes too late finds no part left to take and touches nothing but the record.
+    Every other thread begins with the lower half of the images, from below; and each stage goes the
+    other way than the one before it, so that it finds what a thread has just written in that
+    processor's cache. Whoever is done with a half helps with the other; whoever comes too late
+    finds no part left to take and touches nothing but the record.
     """
     f = Function(module, "work", [POINTER])
     (record,) = f.arguments
-    all_parts = f.times(f.load(INT, record, IMAGES), parts)
+    images = f.load(INT, record, IMAGES)
+    all_parts = f.times(images, parts)
+    mine = f.b.atomic_rmw("add", f.at(record, WORKERS), integer(1), "monotonic")
+    mine = f.b.and_(mine, integer(1))
+    upper, lower = parts - parts // 2, parts // 2
     for i, stage in enumerate(stages):
-        taken = f.at(record, COUNTERS + 2 * i * COUNTER)
-        done = f.at(taken, COUNTER)
-        take, run, rest, wait, after = (f.b.append_basic_block() for _ in range(5))
-        f.b.branch(take)
+        done = f.at(record, COUNTERS + 3 * i * COUNTER)
 
-        f.b.position_at_end(take)
-        part = f.b.atomic_rmw("add", taken, integer(1), "monotonic")
-        f.b.cbranch(f.less(part, all_parts), run, rest)
+        def take_all(half, i=i, stage=stage, done=done):
+            is_lower = f.b.icmp_signed("==", half, integer(1))
+            taken = f.at(done, COUNTER, f.times(half, COUNTER))
+            each = f.b.select(is_lower, integer(lower), integer(upper))
+            ask, run, after = (f.b.append_basic_block() for _ in range(3))
+            f.b.branch(ask)
 
-        f.b.position_at_end(run)
-        image, part = f.b.sdiv(part, integer(parts)), f.b.srem(part, integer(parts))
-        f.b.call(stage, [f.at(record, ARRAYS), image, part])
-        f.b.atomic_rmw("add", done, integer(1), "release")
-        f.b.branch(take)
+            f.b.position_at_end(ask)
+            part = f.b.atomic_rmw("add", taken, integer(1), "monotonic")
+            f.b.cbranch(f.less(part, f.b.mul(images, each)), run, after)
+
+            f.b.position_at_end(run)
+            image, part = f.b.sdiv(part, each), f.b.srem(part, each)
+            if i % 2:
+                image = f.b.sub(f.b.sub(images, integer(1)), image)
+                part = f.b.sub(f.b.sub(each, integer(1)), part)
+            part = f.b.select(is_lower, f.b.sub(integer(parts - 1), part), part)
+            f.b.call(stage, [f.at(record, ARRAYS), image, part])
+            f.b.atomic_rmw("add", done, integer(1), "release")
+            f.b.branch(ask)
+
+            f.b.position_at_end(after)
+
+        take_all(mine)
+        take_all(f.b.sub(integer(1), mine))
+        rest, wait, after = (f.b.append_basic_block() for _ in range(3))
+        f.b.branch(rest)
 
         f.b.position_at_end(rest)
         finished = f.b.load_atomic(done, "acquire", 8, typ=INT)
@@ -141,7 +163,7 @@ def _handler(module, work, stages: int, parts: int, arguments: int, results: lis
     succeeds(API_THREADS, number)  # else XLA has no threads to share: one
     threads = f.smaller(f.load(INT, number), f.times(images, parts))
 
-    size = COUNTERS + 2 * stages * COUNTER
+    size = COUNTERS + 3 * stages * COUNTER
     record = f.b.call(f.external("malloc", POINTER, INT), [integer(size)])
     f.loop(0, size // 8, lambda i, _: f.store(integer(0), record, f.times(i, 8)))
     f.store(threads, record, USERS)

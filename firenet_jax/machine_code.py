@@ -63,6 +63,12 @@ class Function:
     def store(self, value, pointer, *byte_offsets):
         self.b.store(value, self.at(pointer, *byte_offsets), align=ALIGNED[value.type])
 
+    def will_write(self, pointer, *byte_offsets):
+        """Fetches this into the nearest cache; the memory need not exist."""
+        how = [integer32(number) for number in (1, 3, 1)]  # to write, and again, data
+        fetch = self.external("llvm.prefetch.p0", VOID, POINTER, INT32, INT32, INT32)
+        self.b.call(fetch, [self.at(pointer, *byte_offsets), *how])
+
     def local(self, size: int):
         """So many bytes that last until the function returns."""
         with self.b.goto_entry_block():

@@ -56,6 +56,16 @@ def test_equals_the_step_of_the_network(height, width):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), found, expected)
 
 
+@pytest.mark.parametrize("halves", [(1,), (1, 2), (5 / 8, 3 / 2)])
+def test_winograd_is_a_correlation(halves):
+    direction = native._winograd(*halves)
+    rng = np.random.default_rng(0)
+    pixels, kernel = rng.normal(size=direction.patch), rng.normal(size=3)
+    products = (direction.kernel @ kernel) * (direction.input @ pixels)
+    found = direction.output @ direction.butterfly @ products
+    np.testing.assert_allclose(found, np.correlate(pixels, kernel), atol=1e-5)
+
+
 def test_processors_with_vectors_of_256_bits(monkeypatch):
     """The instructions of one run on all that have more."""
     features = machine_code.binding.FeatureMap({"avx2": True, "fma": True})
