@@ -15,7 +15,7 @@ step outside of a scan is PyTorch's only kind. Before anything is timed the floa
 asserted to be equal: images to 1e-4, pictures to a level, loss and gradient to 1e-4 of them.
 float32 is float32 on a GPU too: TF32 is off on both sides.
 
-    python experiments/xla_vs_pytorch.py            35 minutes on two cores; needs torch
+    python experiments/xla_vs_pytorch.py            an hour on two cores; needs torch
     python experiments/xla_vs_pytorch.py --parts training               measures one part again
     python experiments/xla_vs_pytorch.py --quick                        5 minutes; saves nothing
 

@@ -6,6 +6,7 @@ before it is done. The arrays are XLA's (`jax.ffi`): none is copied, nothing wai
 """
 
 import ctypes
+from collections.abc import Callable
 
 import jax
 
@@ -101,20 +102,45 @@ def _work(module: Module, stages: list[Code], parts: int) -> Code:
 
         take_all(mine)
         take_all(f.b.sub(integer(1), mine))
-        rest, wait, after = (f.b.append_basic_block() for _ in range(3))
-        f.b.branch(rest)
-
-        f.b.position_at_end(rest)
-        finished = f.b.load_atomic(done, "acquire", 8, typ=INT)
-        f.b.cbranch(f.less(finished, all_parts), wait, after)
-
-        f.b.position_at_end(wait)
-        f.b.call(f.external("sched_yield", INT32), [])
-        f.b.branch(rest)
-
-        f.b.position_at_end(after)
+        _wait(f, lambda done=done: f.less(f.b.load_atomic(done, "acquire", 8, typ=INT), all_parts))
     f.b.ret_void()
     return f.function
+
+
+def _wait(f: Function, is_missing: Callable) -> None:
+    """Until the others are done: at first awake, for they soon are.
+
+    Then in longer and longer sleeps, so that threads without a processor of their own (in a
+    container that may use a few of many) do not take the time of those that work.
+    """
+    awake, doublings, microseconds = 200, 4, 20
+    before = f.b.block
+    ask, wait, rest, sleep, again, after = (f.b.append_basic_block() for _ in range(6))
+    f.b.branch(ask)
+
+    f.b.position_at_end(ask)
+    times = f.b.phi(INT)
+    times.add_incoming(integer(0), before)
+    f.b.cbranch(is_missing(), wait, after)
+
+    f.b.position_at_end(wait)
+    f.b.cbranch(f.less(times, awake), rest, sleep)
+
+    f.b.position_at_end(rest)
+    f.b.call(f.external("sched_yield", INT32), [])
+    f.b.branch(again)
+
+    f.b.position_at_end(sleep)
+    doubled = f.smaller(f.b.sub(times, integer(awake)), doublings)
+    time = f.b.trunc(f.b.shl(integer(microseconds), doubled), INT32)
+    f.b.call(f.external("usleep", INT32, INT32), [time])
+    f.b.branch(again)
+
+    f.b.position_at_end(again)
+    times.add_incoming(f.b.add(times, integer(1)), again)
+    f.b.branch(ask)
+
+    f.b.position_at_end(after)
 
 
 def _leave(f: Function, record) -> None:

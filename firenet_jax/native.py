@@ -557,6 +557,7 @@ def step(
         _target(height, width),
         [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes],
         input_output_aliases={3: 0, 4: 1},
+        vmap_method="sequential",
     )
     g1, g2, image, _ = call(tensor, packed, exists.astype(jnp.float32), *state)
     return State(g1, g2), image

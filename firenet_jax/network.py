@@ -150,6 +150,8 @@ def step(
 ) -> tuple[State, jax.Array]:
     """One window: (State, (B, H, W, 5)) -> (State, (B, H, W)), the same function everywhere.
 
+    On a CPU `native.step` computes it too, where nobody asks for gradients.
+
     event_tensor: normalised if the weights ask for it (`tensors.normalise`).
     exists: (B,) bool; where False the state stays as it was and the image means nothing (the event
     tensor must be finite there too: zeros, for instance).

@@ -57,6 +57,8 @@ def reconstruct(
     valid: (T, B) bool; where False the state stays as it was and the image means nothing (tensors
     must be finite there too).
     recurrent: False starts every window from a zero state (the state returned is zero).
+    On a CPU, in float32, the scan's body is `native.step`, where there is one; gradients, in
+    reverse mode only, are those of `network.step`.
     Raises ValueError where the shapes of state and tensors do not belong together.
     """
     _check_shapes(state, tensors)

@@ -86,6 +86,18 @@ def test_leaves_its_arguments_alone():
     jax.tree.map(np.testing.assert_array_equal, state, before)
 
 
+def test_can_be_mapped():
+    params, tensors = random_run(steps=2, batch=4, height=9, width=14)
+    weights = Weights(params, True)
+
+    def alone(tensors):  # (T, H, W, 5)
+        return reconstruct(weights, initial_state(1, 9, 14), tensors[:, None])[1][:, 0]
+
+    expected = reconstruct(weights, initial_state(4, 9, 14), tensors)[1]
+    found = jax.vmap(alone, in_axes=1, out_axes=1)(tensors)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
 def test_many_at_once_give_the_same_bits():
     params, tensors = random_run(steps=5, batch=2, height=40, width=50)
     weights = Weights(params, True)
