@@ -36,6 +36,10 @@ def integer32(value: int) -> ir.Constant:
     return ir.Constant(INT32, value)
 
 
+def number(value: float) -> ir.Constant:
+    return ir.Constant(FLOAT, float(np.float32(value)))
+
+
 def vector(value: float) -> ir.Constant:
     return ir.Constant(VECTOR, [float(np.float32(value))] * LANES)
 
@@ -59,6 +63,16 @@ class Function:
 
     def load(self, kind, pointer, *byte_offsets):
         return self.b.load(self.at(pointer, *byte_offsets), typ=kind, align=ALIGNED[kind])
+
+    def load_some(self, pointer, count):
+        """A vector of the numbers from here on, zeros from the count-th (int64) on."""
+        mask = ir.VectorType(ir.IntType(1), LANES)
+        load = self.external(
+            f"llvm.masked.load.v{LANES}f32.p0", VECTOR, POINTER, INT32, mask, VECTOR
+        )
+        lanes = ir.Constant(INTS, list(range(LANES)))
+        exist = self.b.icmp_signed("<", lanes, self.everywhere(self.b.trunc(count, INT32)))
+        return self.b.call(load, [pointer, integer32(ALIGNED[FLOAT]), exist, vector(0)])
 
     def store(self, value, pointer, *byte_offsets):
         self.b.store(value, self.at(pointer, *byte_offsets), align=ALIGNED[value.type])
@@ -124,7 +138,7 @@ class Function:
         return self.numbers("fma", a, b, c)
 
     def everywhere(self, number):
-        undefined = ir.Constant(VECTOR, ir.Undefined)
+        undefined = ir.Constant(ir.VectorType(number.type, LANES), ir.Undefined)
         first = self.b.insert_element(undefined, number, integer32(0))
         return self.b.shuffle_vector(first, undefined, ir.Constant(INTS, [0] * LANES))
 
@@ -136,6 +150,9 @@ class Function:
     def larger(self, x, bound):
         """Not a number stays so."""
         return self.b.select(self.b.fcmp_ordered("<", x, bound), bound, x)
+
+    def is_not_zero(self, x):
+        return self.b.fcmp_unordered("!=", x, vector(0))
 
     def relu(self, x):
         return self.larger(x, vector(0))

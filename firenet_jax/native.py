@@ -37,7 +37,7 @@ from firenet_jax.machine_code import (
     Function,
     Module,
     integer,
-    integer32,
+    number,
     vector,
     vectors,
 )
@@ -159,6 +159,7 @@ STAGES = [
     *_residual("g2", "image", _prediction),
 ]
 INNER = ("tensor", "map", "reset", "update", "between")  # maps that nobody sees from outside
+MOMENTS = ("count", "sum", "squares")  # of the numbers that are not zero; squares of deviations
 
 
 def _inputs(stage: Stage) -> int:
@@ -227,6 +228,15 @@ class Size(NamedTuple):
         return (ROWS.tile * self.down + 2) * self.line
 
     @property
+    def moments(self) -> int:
+        """Bytes of what is known of the numbers of each four rows of an event tensor."""
+        return -(-len(MOMENTS) * 4 * self.down // PIXEL) * PIXEL
+
+    @property
+    def inner(self) -> int:
+        return len(INNER) * self.map + self.moments
+
+    @property
     def place(self) -> int:
         """Bytes of one place of all tiles of a block."""
         return self.block * PIXEL
@@ -237,11 +247,11 @@ def _linear(f: Function, matrix: np.ndarray, values: list) -> list:
 
     def combined(row):
         result = None
-        for number, value in zip(row, values, strict=True):
-            if number and result is None:
-                result = value if number == 1 else f.b.fmul(vector(number), value)
-            elif number:
-                result = f.fma(vector(number), value, result)
+        for factor, value in zip(row, values, strict=True):
+            if factor and result is None:
+                result = value if factor == 1 else f.b.fmul(vector(factor), value)
+            elif factor:
+                result = f.fma(vector(factor), value, result)
         return result
 
     results = []
@@ -353,13 +363,15 @@ def _arrays(f: Function, size: Size, pointers, image) -> dict:
         "g1": size.map,
         "g2": size.map,
         "image": 4 * size.height * size.width,
-        "inner": len(INNER) * size.map,
+        "inner": size.inner,
     }
     arrays = {
         name: f.at(f.load(POINTER, pointers, 8 * i), f.times(image, step))
         for i, (name, step) in enumerate(bytes_of_an_image.items())
     }
-    return arrays | {name: f.at(arrays["inner"], i * size.map) for i, name in enumerate(INNER)}
+    arrays |= {name: f.at(arrays["inner"], i * size.map) for i, name in enumerate(INNER)}
+    moments = f.at(arrays["inner"], len(INNER) * size.map)
+    return arrays | {name: f.at(moments, i * 4 * size.down) for i, name in enumerate(MOMENTS)}
 
 
 def _rows(f: Function, size: Size, part):
@@ -391,22 +403,90 @@ def _border(f: Function, size: Size, map, part) -> None:
             clear(map, start * columns, stop * columns)
 
 
-def _events(module: Module, size: Size) -> Code:
+# What becomes of the event tensor's numbers: (function, size, arrays) -> (vector -> vector).
+
+
+def _itself(f, size, arrays):
+    return lambda numbers: numbers
+
+
+def _voted(f, size, arrays):
+    return lambda numbers: f.b.select(f.is_not_zero(numbers), vector(1), vector(0))
+
+
+def _deviation(f, size, arrays):
+    mean = f.b.fdiv(_total(f, size, arrays, "sum"), _count(f, size, arrays))
+    return lambda x: f.b.select(f.is_not_zero(x), f.b.fsub(x, mean), vector(0))
+
+
+def _square(f, size, arrays):
+    deviation = _deviation(f, size, arrays)
+
+    def square(numbers):
+        deviations = deviation(numbers)
+        return f.b.fmul(deviations, deviations)
+
+    return square
+
+
+def _normalised(f, size, arrays):
+    """As `tensors.normalise`."""
+    deviation = _deviation(f, size, arrays)
+    variance = f.b.fdiv(_total(f, size, arrays, "squares"), _count(f, size, arrays))
+    inverse = f.b.fdiv(vector(1), f.numbers("sqrt", variance))
+    scale = f.b.select(f.b.fcmp_ordered(">=", variance, vector(1e-12)), inverse, vector(0))
+    return lambda numbers: f.b.fmul(deviation(numbers), scale)
+
+
+def _total(f: Function, size: Size, arrays: dict, moment: str):
+    """Of all parts, in each lane."""
+
+    def add(i, total):
+        return [f.b.fadd(total[0], f.load(FLOAT, arrays[moment], f.times(i, 4)))]
+
+    return f.everywhere(f.loop(0, size.down, add, [number(0)])[0])
+
+
+def _count(f: Function, size: Size, arrays: dict):
+    return f.larger(_total(f, size, arrays, "count"), vector(1))
+
+
+def _moments(module: Module, size: Size, terms: dict[str, Callable]) -> Code:
+    """Of four rows of the event tensor: sums of these terms over all numbers."""
+    f = Function(module, "moments_" + "_".join(terms), [POINTER, INT, INT])
+    pointers, image, part = f.arguments
+    arrays = _arrays(f, size, pointers, image)
+    top, bottom = _rows(f, size, part)
+    events = f.at(arrays["events"], f.times(top, 4 * BINS * size.width))
+    count = f.times(f.b.sub(bottom, top), BINS * size.width)
+    term_of = [term(f, size, arrays) for term in terms.values()]
+
+    def add(i, sums):
+        numbers = f.load_some(f.at(events, f.times(i, PIXEL)), f.b.sub(count, f.times(i, LANES)))
+        return [f.b.fadd(sum_, term(numbers)) for sum_, term in zip(sums, term_of, strict=True)]
+
+    vectors = f.b.sdiv(f.b.add(count, integer(LANES - 1)), integer(LANES))
+    sums = f.loop(0, vectors, add, [vector(0)] * len(terms))
+    for name, sum_ in zip(terms, sums, strict=True):
+        f.store(f.total(sum_, number(0)), arrays[name], f.times(part, 4))
+    f.b.ret_void()
+    return f.function
+
+
+def _events(module: Module, size: Size, becomes: Callable) -> Code:
     """The event tensor as a map: 16 channels instead of 5, zeros around."""
     f = Function(module, "events", [POINTER, INT, INT])
     pointers, image, part = f.arguments
     arrays = _arrays(f, size, pointers, image)
+    becomes = becomes(f, size, arrays)
 
     def row(y, _):
         numbers = f.at(arrays["events"], f.times(y, 4 * BINS * size.width))
         line = f.at(arrays["tensor"], f.times(y, size.line), size.line + PIXEL)
 
         def pixel(x, _):
-            value = vector(0)
-            for c in range(BINS):
-                number = f.load(FLOAT, numbers, f.times(x, 4 * BINS), 4 * c)
-                value = f.b.insert_element(value, number, integer32(c))
-            f.store(value, line, f.times(x, PIXEL))
+            here = f.at(numbers, f.times(x, 4 * BINS))
+            f.store(becomes(f.load_some(here, integer(BINS))), line, f.times(x, PIXEL))
 
         f.loop(0, size.width, pixel)
 
@@ -495,32 +575,38 @@ def _weights(stage: int) -> int:
 
 
 @cache
-def _target(height: int, width: int) -> str:
+def _target(height: int, width: int, normalise: bool) -> str:
     """The name by which XLA knows the step for images of this size, compiled when first asked.
 
     Raises RuntimeError where XLA's interface is no longer the one of `foreign_call`.
     """
     size, module = Size(height, width), Module()
+    if normalise:
+        moments = [{"count": _voted, "sum": _itself}, {"squares": _square}]
+        first = [_moments(module, size, terms) for terms in moments]
+        first.append(_events(module, size, _normalised))
+    else:
+        first = [_events(module, size, _itself)]
     parts = [write(module, size) for write in (_transform, _multiply, _restore)]
     stages = [
         _stage(module, size, f"stage{i}", stage, _weights(i), *parts)
         for i, stage in enumerate(STAGES)
     ]
-    name = f"firenet_step_{height}_{width}"
-    register(name, module, [_events(module, size), *stages], size.down, 5, [2, 3])
+    name = f"firenet_step_{height}_{width}" + "_normalised" * normalise
+    register(name, module, [*first, *stages], size.down, 5, [2, 3])
     return name
 
 
 # --- To JAX ------------------------------------------------------------------------------------
 
 
-def supports(height: int, width: int) -> bool:
+def supports(height: int, width: int, normalise: bool = False) -> bool:
     """Whether `step` runs for images of this size, here; compiles it."""
     if vectors() == 0 or jax.default_backend() != "cpu":
         return False
     with _compiling:  # threads that ask together: a name is registered once
         try:
-            _target(height, width)
+            _target(height, width, normalise)
         except RuntimeError as error:
             warnings.warn(f"reconstruction is slower than it could be here: {error}", stacklevel=2)
             return False
@@ -545,16 +631,23 @@ def interior(state: State, height: int, width: int) -> State:
 
 
 def step(
-    packed: jax.Array, state: State, tensor: jax.Array, exists: jax.Array | None = None
+    packed: jax.Array,
+    state: State,
+    tensor: jax.Array,
+    exists: jax.Array | None = None,
+    normalise: bool = False,
 ) -> tuple[State, jax.Array]:
-    """One window, as `network.step`, of packed parameters and an enclosed state; no gradient."""
+    """One window, as `network.step`, of packed parameters and an enclosed state; no gradient.
+
+    normalise: the tensor first, as `tensors.normalise` does.
+    """
     batch, height, width, _ = tensor.shape
     exists = jnp.ones(batch) if exists is None else exists
     size = Size(height, width)
     shapes = [h.shape for h in state]
-    shapes += [(batch, height, width), (batch * len(INNER) * size.map // 4,)]
+    shapes += [(batch, height, width), (batch * size.inner // 4,)]
     call = jax.ffi.ffi_call(
-        _target(height, width),
+        _target(height, width, normalise),
         [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes],
         input_output_aliases={3: 0, 4: 1},
         vmap_method="sequential",

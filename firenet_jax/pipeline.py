@@ -101,7 +101,8 @@ class Reconstruct:
     sensor_size: str | None = None
     """WIDTHxHEIGHT of the sensor, such as 240x180, where the recording does not say it."""
     chunk: int | None = None
-    """Windows a recording gives the device at once (default: 4 on a CPU, 16 elsewhere)."""
+    """Windows a recording gives the device at once (default: 16; on a CPU 8 of a sensor of up to
+    65,536 pixels, 4 of larger ones)."""
     batch: int | None = None
     """Recordings that run side by side, shared by the devices (default: one for each device)."""
     overwrite: bool = False
@@ -394,6 +395,14 @@ def _get_slot(session: Session, slot) -> Session:
     return jax.tree.map(lambda all: all[slot], session)
 
 
+def chunk_for(pixels: int) -> int:
+    """Windows that a device takes at once, where nothing is asked: what a chunk costs by itself is
+    shared by more, but they take more memory."""
+    if jax.default_backend() != "cpu":
+        return 16
+    return 8 if pixels <= 2**16 else 4
+
+
 def in_chunks(
     jobs: list[Job],
     settings: Reconstruct,
@@ -402,7 +411,7 @@ def in_chunks(
     failed: dict[Path, RecordingError],
 ) -> Iterator[Chunk]:
     """Jobs -> chunks of T x B windows, B the slots; a free slot takes the next job."""
-    steps = settings.chunk or (4 if jax.default_backend() == "cpu" else 16)
+    steps = settings.chunk or chunk_for(jobs[0].recording.pixels)
     waiting = iter(jobs)
     running: dict[int, Running] = {}
     size = 0

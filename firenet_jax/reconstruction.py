@@ -64,7 +64,7 @@ def reconstruct(
     _check_shapes(state, tensors)
     if not recurrent:
         state = jax.tree.map(jnp.zeros_like, state)
-    if dtype == jnp.float32 and native.supports(*tensors.shape[2:4]):
+    if dtype == jnp.float32 and native.supports(*tensors.shape[2:4], weights.normalise):
         return _native(recurrent, weights, state, tensors, valid)
     return _scan(
         partial(step, weights.params, dtype=dtype), recurrent, weights, state, tensors, valid
@@ -85,8 +85,10 @@ def _scan(step, recurrent: bool, weights: Weights, state: State, tensors, valid)
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _native(recurrent, weights, state, tensors, valid):
     """The same by the step that has no gradient; for one, everything is computed again by XLA."""
-    native_step = partial(native.step, native.pack(weights.params))
-    state, images = _scan(native_step, recurrent, weights, native.enclose(state), tensors, valid)
+    packed, normalised = native.pack(weights.params), replace(weights, normalise=False)
+    native_step = partial(native.step, packed, normalise=weights.normalise)
+    state = native.enclose(state)
+    state, images = _scan(native_step, recurrent, normalised, state, tensors, valid)
     return native.interior(state, *tensors.shape[2:4]), images
 
 
@@ -177,12 +179,15 @@ def events_to_pictures(
     mesh: devices that share the B recordings equally, for events from `pack_for_devices`.
     """
 
+    # Numbers are normalised before they are padded or dealt out to colours.
+    early = weights.normalise and (network.pad > 1 or network.color)
+
     def shown(weights, session, inputs, valid):
         height, width = inputs.shape[2:4]
         (top, bottom), (left, right) = sides = padding(height, width, network.pad)
         inputs = jnp.pad(inputs, ((0, 0), (0, 0), *sides, (0, 0)), mode="reflect")
         state, images = reconstruct(
-            Weights(weights.params, normalise=False),
+            replace(weights, normalise=weights.normalise and not early),
             session.network,
             inputs,
             valid,
@@ -196,7 +201,7 @@ def events_to_pictures(
 
     def one_device(weights, session, events, valid):
         tensors = voxelise(events, height=height, width=width)
-        inputs = normalise(tensors) if weights.normalise else tensors
+        inputs = normalise(tensors) if early else tensors
         after, pictures = shown(weights, session, inputs, valid)
         if network.color:
             planes = colour.channels(inputs)  # (T, B, 3, H/2, W/2, 5)

@@ -12,6 +12,7 @@ from test_network import random_run
 from firenet_jax import foreign_call, machine_code, native, network
 from firenet_jax.network import State, Weights, initial_state
 from firenet_jax.reconstruction import reconstruct
+from firenet_jax.tensors import normalise
 
 pytestmark = pytest.mark.skipif(
     not native.supports(8, 8), reason="no machine code for this processor"
@@ -54,6 +55,22 @@ def test_equals_the_step_of_the_network(height, width):
     exists = jnp.array([[True, True, True], [True, False, True], [False] * 3, [True] * 3])
     expected, found = both(params, random_state(3, height, width), tensors, exists)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), found, expected)
+
+
+@pytest.mark.parametrize("height, width", [(1, 1), (2, 3), (13, 25), (20, 53)])
+def test_normalises_as_tensors_do(height, width):
+    """Votes around a mean; none; all the same; and few that hardly differ."""
+    params, _ = random_run(steps=1, batch=1, height=height, width=width)
+    rng = np.random.default_rng(3)
+    tensor = rng.normal(0.5, 3, (4, height, width, 5)) * (rng.random((4, height, width, 5)) < 0.4)
+    tensor[1], tensor[2], tensor[3] = 0, -1, 1e-8 * rng.normal(size=tensor[3].shape)
+    tensor = jnp.asarray(tensor, jnp.float32)
+    state, packed = random_state(4, height, width), native.pack(params)
+    expected = native.step(packed, native.enclose(state), normalise(tensor))
+    found = native.step(packed, native.enclose(state), tensor, normalise=True)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), found, expected)
+    raw = native.step(packed, native.enclose(state), tensor)
+    assert abs(raw[1][0] - found[1][0]).max() > 1e-3  # it does make a difference
 
 
 @pytest.mark.parametrize("halves", [(1,), (1, 2), (5 / 8, 3 / 2)])
