@@ -7,15 +7,27 @@ channels; LLVM makes of them what the processor has.
 
 import sys
 from collections.abc import Callable
+from math import factorial
 
 import numpy as np
 from llvmlite import binding, ir
+from numpy.polynomial import Chebyshev, Polynomial
 
 LANES = 16
 INT, INT32, FLOAT, POINTER = ir.IntType(64), ir.IntType(32), ir.FloatType(), ir.PointerType()
 VECTOR, INTS = ir.VectorType(FLOAT, LANES), ir.VectorType(INT32, LANES)
 VECTOR_BYTES = 4 * LANES
 ALIGNED = {VECTOR: VECTOR_BYTES, POINTER: 8, INT: 8, INT32: 4, FLOAT: 4}
+
+LN2 = float(np.log(2))
+# (e^r - 1 - r) / r^2 as a polynomial, to 1e-8 where |r| is at most half of ln 2.
+EXP = (
+    Chebyshev.interpolate(
+        lambda r: sum(r**k / factorial(k + 2) for k in range(12)), 4, (-LN2 / 2, LN2 / 2)
+    )
+    .convert(kind=Polynomial)
+    .coef
+)
 
 VOID, NULL = ir.VoidType(), ir.Constant(POINTER, None)
 Module, Code = ir.Module, ir.Function  # of LLVM
@@ -76,12 +88,6 @@ class Function:
 
     def store(self, value, pointer, *byte_offsets):
         self.b.store(value, self.at(pointer, *byte_offsets), align=ALIGNED[value.type])
-
-    def will_write(self, pointer, *byte_offsets):
-        """Fetches this into the nearest cache; the memory need not exist."""
-        how = [integer32(number) for number in (1, 3, 1)]  # to write, and again, data
-        fetch = self.external("llvm.prefetch.p0", VOID, POINTER, INT32, INT32, INT32)
-        self.b.call(fetch, [self.at(pointer, *byte_offsets), *how])
 
     def local(self, size: int):
         """So many bytes that last until the function returns."""
@@ -158,16 +164,18 @@ class Function:
         return self.larger(x, vector(0))
 
     def exp(self, x):
-        """2^n e^r, r between half of -ln 2 and of ln 2: a polynomial (expf of Moshier's Cephes)."""
+        """2^n e^r, r between half of -ln 2 and of ln 2."""
         x = self.larger(x, vector(-87))
         x = self.b.select(self.b.fcmp_ordered(">", x, vector(88)), vector(88), x)
-        n = self.numbers("rint", self.b.fmul(x, vector(1.44269504088896341)))
-        r = self.fma(n, vector(2.12194440e-4), self.fma(n, vector(-0.693359375), x))
-        series = vector(1.9875691500e-4)
-        for term in (1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 0.5):
+        # Added to a number this large, a fraction is rounded away; n is in the last bits.
+        large = vector(1.5 * 2**23)
+        shifted = self.fma(x, vector(1 / LN2), large)
+        r = self.fma(self.b.fsub(shifted, large), vector(-LN2), x)
+        series = vector(EXP[-1])
+        for term in EXP[-2::-1]:
             series = self.fma(series, r, vector(term))
         series = self.fma(self.b.fmul(series, r), r, self.b.fadd(r, vector(1)))
-        exponent = self.b.shl(self.b.fptosi(n, INTS), ir.Constant(INTS, [23] * LANES))
+        exponent = self.b.shl(self.b.bitcast(shifted, INTS), ir.Constant(INTS, [23] * LANES))
         return self.b.bitcast(self.b.add(self.b.bitcast(series, INTS), exponent), VECTOR)
 
     def sigmoid(self, x):

@@ -60,10 +60,8 @@ class Winograd(NamedTuple):
 
 
 def _winograd(*halves: float) -> Winograd:
-    """Interpolation at 0, each of these numbers and its negative, and infinity."""
-    points = [0.0]
-    for half in halves:
-        points += [half, -half]
+    """Interpolation at each of these numbers and its negative, at 0, and at infinity."""
+    points = [*(sign * half for half in halves for sign in (1, -1)), 0.0]
     tile, patch = len(points) - 1, len(points) + 1
     kernel, polynomials = [], []
     for point in points:
@@ -73,8 +71,8 @@ def _winograd(*halves: float) -> Winograd:
         polynomials.append([*np.poly(others)[::-1], 0])
     # What belongs to a number and its negative is added and subtracted first.
     butterfly, output = np.eye(patch), np.zeros((tile, patch))
-    output[0, 0] = output[-1, -1] = 1
-    for i, half in zip(range(1, patch, 2), halves, strict=False):
+    output[0, -2] = output[-1, -1] = 1
+    for i, half in zip(range(0, patch, 2), halves, strict=False):
         butterfly[i : i + 2, i : i + 2] = [[1, 1], [1, -1]]
         for k in range(tile):
             output[k, i + k % 2] = half**k
@@ -92,7 +90,10 @@ def _winograd(*halves: float) -> Winograd:
 # Of F(4, 3)'s numbers with few bits those of the least error; the usual 1 and 2 have twice of it.
 # F(4, 3) in both directions is a tenth faster, but not exact to 1e-5 in all states.
 ROWS, COLUMNS = _winograd(5 / 8, 3 / 2), _winograd(1)
-PLACES = ROWS.patch * COLUMNS.patch  # of a transformed patch
+# Two of the six rows of transformed patches at a time: with the kernels for them and the pixels
+# that they are made of they stay in the nearest cache, all six would not.
+GROUPS = [slice(row, row + 2) for row in range(0, ROWS.patch, 2)]
+PLACES = 2 * COLUMNS.patch  # of two rows
 
 # --- The network -------------------------------------------------------------------------------
 
@@ -184,7 +185,7 @@ def pack(params) -> jax.Array:
     parts, start = [], 0
     for convolution in convolutions:
         _, _, inputs, outputs = convolution["kernel"].shape
-        kernel = flat[:, start : start + inputs * outputs].reshape(PLACES, inputs, outputs)
+        kernel = flat[:, start : start + inputs * outputs].reshape(-1, inputs, outputs)
         kernel = jnp.pad(kernel, ((0, 0), (0, -inputs % STEP), (0, 0)))
         parts += [convolution["bias"], kernel]
         start += inputs * outputs
@@ -206,9 +207,10 @@ class Size(NamedTuple):
     def block(self) -> int:
         """Tiles of a row that are worked on together, their sums in registers.
 
-        A number that leaves little over: a block of n costs about as much as n + 1.
+        A number that leaves little over: a block of n costs about as much as n + 1. With more than
+        8, caches overflow; with fewer, products wait for the sums that they are added to.
         """
-        most = min(self.across, 12 if vectors() == 32 else 6)
+        most = min(self.across, 8 if vectors() == 32 else 6)
         return min(range(1, most + 1), key=lambda n: -(-self.across // n) * (n + 1))
 
     @property
@@ -243,7 +245,10 @@ class Size(NamedTuple):
 
 
 def _linear(f: Function, matrix: np.ndarray, values: list) -> list:
-    """The matrix times vectors. Rows that differ only in signs share what they have in common."""
+    """The matrix times vectors; None for a row of zeros.
+
+    Two rows that differ only in signs share what they have in common.
+    """
 
     def combined(row):
         result = None
@@ -257,7 +262,7 @@ def _linear(f: Function, matrix: np.ndarray, values: list) -> list:
     results = []
     for i, row in enumerate(matrix):
         before, after = matrix[i - 1] if i else None, matrix[min(i + 1, len(matrix) - 1)]
-        if i and np.array_equal(abs(row), abs(before)):
+        if i and np.array_equal(abs(row), abs(before)) and not np.array_equal(row, before):
             continue
         if np.array_equal(abs(row), abs(after)) and not np.array_equal(row, after):
             same = combined(np.where(row == after, row, 0))
@@ -268,25 +273,21 @@ def _linear(f: Function, matrix: np.ndarray, values: list) -> list:
     return results
 
 
-def _transform(module: Module, size: Size) -> Code:
+def _transform(module: Module, size: Size, rows: slice) -> Code:
     """transform(upper left neighbour of a block, transformed): B^T d B, (places, tiles)."""
-    f = Function(module, "transform", [POINTER, POINTER])
+    f = Function(module, f"transform{rows.start}", [POINTER, POINTER])
     f.function.attributes.add("noinline")
     corner, transformed = f.arguments
 
     def column(pixel, x):
         pixels = [f.load(VECTOR, pixel, y * size.line + x * PIXEL) for y in range(ROWS.patch)]
-        return _linear(f, ROWS.input, pixels)
+        return _linear(f, ROWS.input[rows], pixels)
 
     def tile(t, left):
         """The first two of its columns are the last two of the tile to the left."""
         here = f.at(corner, f.times(t, COLUMNS.tile * PIXEL))
-        # Kernels have driven the last block's tiles out of the nearest cache: asked for one tile
-        # early, it takes the stores without waiting (7 % of the whole step).
-        for place in range(PLACES):
-            f.will_write(transformed, f.times(t, PIXEL), place * size.place + PIXEL)
         new = [column(here, x) for x in range(2, COLUMNS.patch)]
-        columns = [left[: ROWS.patch], left[ROWS.patch :], *new]
+        columns = [left[:2], left[2:], *new]
         for i, row in enumerate(zip(*columns, strict=True)):
             for j, value in enumerate(_linear(f, COLUMNS.input, list(row))):
                 f.store(value, transformed, f.times(t, PIXEL), (COLUMNS.patch * i + j) * size.place)
@@ -331,23 +332,26 @@ def _multiply(module: Module, size: Size) -> Code:
     return f.function
 
 
-def _restore(module: Module, size: Size) -> Code:
-    """restore(sums, pixels): A^T sums A, rows of the block's pixels."""
-    f = Function(module, "restore", [POINTER, POINTER])
+def _restore(module: Module, size: Size, rows: slice) -> Code:
+    """restore(sums, pixels): A^T sums A, added to the pixels of the block; the first rows begin."""
+    f = Function(module, f"restore{rows.start}", [POINTER, POINTER])
     f.function.attributes.add("noinline")
     sums, pixels = f.arguments
-
-    def output(direction, values):
-        return _linear(f, direction.output, _linear(f, direction.butterfly, values))
 
     def tile(t, _):
         here = f.at(sums, f.times(t, PIXEL))
         places = [f.load(VECTOR, here, i * size.place) for i in range(PLACES)]
-        columns = [output(ROWS, places[j :: COLUMNS.patch]) for j in range(COLUMNS.patch)]
-        for y, row in enumerate(zip(*columns, strict=True)):
-            for x, value in enumerate(output(COLUMNS, list(row))):
-                place = y * COLUMNS.tile * size.place + x * PIXEL
-                f.store(value, pixels, f.times(t, COLUMNS.tile * PIXEL), place)
+        across = []
+        for row in (places[: COLUMNS.patch], places[COLUMNS.patch :]):
+            across.append(_linear(f, COLUMNS.output, _linear(f, COLUMNS.butterfly, row)))
+        for x, pair in enumerate(zip(*across, strict=True)):
+            pair = _linear(f, ROWS.butterfly[rows, rows], list(pair))
+            for y, value in enumerate(_linear(f, ROWS.output[:, rows], pair)):
+                place = f.at(pixels, f.times(t, COLUMNS.tile * PIXEL))
+                place = f.at(place, y * COLUMNS.tile * size.place + x * PIXEL)
+                if value is not None:
+                    before = f.load(VECTOR, place) if rows.start else None
+                    f.store(f.b.fadd(before, value) if before else value, place)
 
     f.loop(0, size.block, tile)
     f.b.ret_void()
@@ -502,9 +506,9 @@ def _stage(
     name: str,
     stage: Stage,
     weights: int,
-    transform: Code,
+    transform: list[Code],
     multiply: Code,
-    restore: Code,
+    restore: list[Code],
 ) -> Code:
     """Four rows of a stage whose weights begin at this byte."""
     f = Function(module, name, [POINTER, INT, INT])
@@ -512,13 +516,13 @@ def _stage(
     arrays = _arrays(f, size, pointers, image)
     transformed = f.local(len(stage.sources) * PLACES * size.place)
     sums = f.local(PLACES * size.place)
-    pixels = f.local(ROWS.tile * COLUMNS.tile * size.place)
+    pixels = [f.local(ROWS.tile * COLUMNS.tile * size.place) for _ in stage.layers]
     f.exists = f.everywhere(f.load(FLOAT, arrays["exists"]))
     f.prediction = f.load(VECTOR, arrays["weights"], _weights(len(STAGES)))
     f.offset = f.load(FLOAT, arrays["weights"], _weights(len(STAGES)) + PIXEL)
     top, bottom = _rows(f, size, part)
 
-    def finish(layer, bias, left, fresh):
+    def finish(layer, bias, pixels, left, fresh):
         """What the layer makes of the pixels of the block that are in the image."""
         right = f.smaller(f.b.sub(integer(size.width), left), COLUMNS.tile * size.block)
 
@@ -548,18 +552,19 @@ def _stage(
         first = f.smaller(wanted, size.across - size.block)
         left, fresh = f.times(first, COLUMNS.tile), f.times(f.b.sub(wanted, first), COLUMNS.tile)
         corner = f.b.add(f.times(top, size.line), f.times(left, PIXEL))
-        for s, source in enumerate(stage.sources):
-            there = f.at(transformed, s * PLACES * size.place)
-            f.b.call(transform, [f.at(arrays[source], corner), there])
-        maps = len(stage.sources)
-        each = integer(_inputs(stage) // maps)
-        offset = weights
-        for layer in stage.layers:
-            kernels = f.at(arrays["weights"], offset + PIXEL)
-            f.b.call(multiply, [transformed, kernels, sums, integer(maps), each])
-            f.b.call(restore, [sums, pixels])
-            finish(layer, f.load(VECTOR, arrays["weights"], offset), left, fresh)
-            offset += PIXEL + PLACES * _inputs(stage) * PIXEL
+        maps, inputs = len(stage.sources), _inputs(stage)
+        starts = [weights + i * _weights_of_layer(stage) for i in range(len(stage.layers))]
+        for group, (forth, back) in enumerate(zip(transform, restore, strict=True)):
+            for s, source in enumerate(stage.sources):
+                there = f.at(transformed, s * PLACES * size.place)
+                f.b.call(forth, [f.at(arrays[source], corner), there])
+            for start, of_layer in zip(starts, pixels, strict=True):
+                kernels = f.at(arrays["weights"], start + PIXEL + group * PLACES * inputs * PIXEL)
+                each = integer(inputs // maps)
+                f.b.call(multiply, [transformed, kernels, sums, integer(maps), each])
+                f.b.call(back, [sums, of_layer])
+        for layer, start, of_layer in zip(stage.layers, starts, pixels, strict=True):
+            finish(layer, f.load(VECTOR, arrays["weights"], start), of_layer, left, fresh)
 
     f.loop(0, -(-size.across // size.block), block)
     for layer in stage.layers:
@@ -569,9 +574,14 @@ def _stage(
     return f.function
 
 
+def _weights_of_layer(stage: Stage) -> int:
+    """Bytes of a bias and of all kernels."""
+    return (1 + len(GROUPS) * PLACES * _inputs(stage)) * PIXEL
+
+
 def _weights(stage: int) -> int:
     """Where the weights of a stage begin, in bytes; after the last stage the prediction's."""
-    return sum(len(each.layers) * (1 + PLACES * _inputs(each)) * PIXEL for each in STAGES[:stage])
+    return sum(len(each.layers) * _weights_of_layer(each) for each in STAGES[:stage])
 
 
 @cache
@@ -587,9 +597,12 @@ def _target(height: int, width: int, normalise: bool) -> str:
         first.append(_events(module, size, _normalised))
     else:
         first = [_events(module, size, _itself)]
-    parts = [write(module, size) for write in (_transform, _multiply, _restore)]
+    transform, restore = (
+        [write(module, size, rows) for rows in GROUPS] for write in (_transform, _restore)
+    )
+    multiply = _multiply(module, size)
     stages = [
-        _stage(module, size, f"stage{i}", stage, _weights(i), *parts)
+        _stage(module, size, f"stage{i}", stage, _weights(i), transform, multiply, restore)
         for i, stage in enumerate(STAGES)
     ]
     name = f"firenet_step_{height}_{width}" + "_normalised" * normalise
