@@ -17,6 +17,7 @@ float32 is float32 on a GPU too: TF32 is off on both sides.
 
     python experiments/xla_vs_pytorch.py            an hour on two cores; needs torch
     python experiments/xla_vs_pytorch.py --parts training               measures one part again
+    python experiments/xla_vs_pytorch.py --memory     adds peak MB to what was measured, batch 1
     python experiments/xla_vs_pytorch.py --quick                        5 minutes; saves nothing
 
 A step is held against what direct convolutions cannot beat: their products at the rate of two large
@@ -396,19 +397,26 @@ def compare(part: str, case: tuple, units: dict[str, int], options) -> dict:
     seconds = interleaved(methods, options.runs, REST)
     seconds = {name: [s / units.get(name, 1) for s in runs] for name, runs in seconds.items()}
     rows = table(seconds, base)
-    peaks = {}
-    if options.memory and case[2:] in ((), (1,)):  # batch 1 will do
-        peaks = {name: peak(part, name, case) for name in methods}
-    print(f"{'':34} {'first s':>10} {'peak MB':>9} {'differs by':>12}")
+    print(f"{'':34} {'first s':>10} {'differs by':>12}")
     for row in rows:
         name = row["method"]
-        row |= {"first_s": firsts[name], "peak_mb": peaks.get(name), "differs": differences[name]}
-        shown = "-" if row["peak_mb"] is None else f"{row['peak_mb']:.0f}"
-        print(f"{name:34} {row['first_s']:10.2f} {shown:>9} {row['differs']:12.1e}")
+        row |= {"first_s": firsts[name], "differs": differences[name]}
+        print(f"{name:34} {row['first_s']:10.2f} {row['differs']:12.1e}")
     return {"case": list(case), "rows": rows}
 
 
-def peak(part: str, name: str, case: tuple) -> float:
+def add_memory(part: str, cases: list[dict]) -> None:
+    """`peak_mb` to each method of what was measured; batch 1 will do. The machine may be busy."""
+    for case in cases:
+        if case["case"][2:] not in ([], [1]):
+            continue
+        print(f"\n{part} {' '.join(map(str, case['case']))}")
+        for row in case["rows"]:
+            row["peak_mb"] = peak(part, row["method"], case["case"])
+            print(f"{row['method']:34} {row['peak_mb']:9.0f} MB", flush=True)
+
+
+def peak(part: str, name: str, case: list) -> float:
     """Megabytes that a method needs at most, measured in a process of its own."""
     command = [sys.executable, __file__, "--peak", json.dumps([part, name, *case])]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
@@ -576,19 +584,20 @@ def main():
     parser.add_argument("--parts", default=",".join(MEASURE), help="those to measure")
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--quick", action="store_true", help="smallest sizes, save nothing")
-    parser.add_argument("--no-memory", dest="memory", action="store_false")
+    parser.add_argument("--memory", action="store_true", help="add peak MB instead of timing")
     parser.add_argument("--peak", help=argparse.SUPPRESS)  # a process that `peak` starts
     options = parser.parse_args()
     if DEVICE == "cuda":
         jax.config.update("jax_default_matmul_precision", "highest")
         torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
     if options.peak:
-        return print_peak(*json.loads(options.peak))
+        print_peak(*json.loads(options.peak))
+        return
     torch.compiler.config.force_disable_caches = True  # "first s" is of a first time
     if COMPILER is None:
         print("no C++ compiler: torch.compile is left out")
     if options.quick:
-        options.runs, options.memory = 3, False
+        options.runs = 3
     how = {
         "machine": machine(),
         "torch": torch.__version__,
@@ -596,15 +605,17 @@ def main():
         "compiler": COMPILER,
         "runs": options.runs,
     }
-    # Parts may be of different runs: each says for itself how it was measured.
-    measured = {part: how | MEASURE[part](options) for part in options.parts.split(",")}
-    if options.quick:
-        return None
     name = on_this_device("xla_vs_pytorch")
     path = RESULTS / f"{name}.json"
-    before = json.loads(path.read_text()) if path.exists() else {}
-    results = {part: before[part] for part in MEASURE if part in before} | measured
-    save(name, results)
+    results = json.loads(path.read_text()) if path.exists() else {}
+    for part in options.parts.split(","):
+        if options.memory:
+            add_memory(part, results[part]["cases"])
+        else:  # parts may be of different runs: each says for itself how it was measured
+            results[part] = how | MEASURE[part](options)
+    if options.quick:
+        return
+    save(name, {part: results[part] for part in MEASURE if part in results})
     plot(results, path.with_suffix(".png"))
 
 

@@ -9,8 +9,8 @@ columns are skipped) sets the order of the columns and, where it tells one (`t_u
 the unit of the times; Metavision's `%geometry:1280,720` sets the size and that program's own order.
 Lines are counted from 1, header included; empty lines do not matter.
 
-Blocks of 2 MB go through pyarrow's parser, at 12 million events/s (8 from a zip); only a block
-that it refuses is read again in Python, to name the line.
+Blocks of 2 MB go through pyarrow's parser, which is half of the time of a zip; only a block that it
+refuses is read again in Python, to name the line.
 """
 
 import gzip
