@@ -613,10 +613,9 @@ def main():
             add_memory(part, results[part]["cases"])
         else:  # parts may be of different runs: each says for itself how it was measured
             results[part] = how | MEASURE[part](options)
-    if options.quick:
-        return
-    save(name, {part: results[part] for part in MEASURE if part in results})
-    plot(results, path.with_suffix(".png"))
+        if not options.quick:
+            save(name, {part: results[part] for part in MEASURE if part in results})
+            plot(results, path.with_suffix(".png"))
 
 
 if __name__ == "__main__":
