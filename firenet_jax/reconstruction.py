@@ -179,8 +179,10 @@ def events_to_pictures(
     mesh: devices that share the B recordings equally, for events from `pack_for_devices`.
     """
 
-    # Numbers are normalised before they are padded or dealt out to colours.
-    early = weights.normalise and (network.pad > 1 or network.color)
+    # Numbers are normalised before they are padded or dealt out to colours; an accelerator does it
+    # for all windows at once, a CPU as part of each step.
+    all_at_once = jax.default_backend() != "cpu"
+    early = weights.normalise and (all_at_once or network.pad > 1 or network.color)
 
     def shown(weights, session, inputs, valid):
         height, width = inputs.shape[2:4]
