@@ -9,11 +9,14 @@ published weights', over pairs of sequences. Losses, stages and the mean of weig
 these pictures: they validate, an untouched test they are not. Local equalisation is that of
 `equalise`.
 Recordings: three windows of each after warming up, the same windows for both networks; event
-pictures, theirs, ours. Writes results/shipped_weights.json, docs/shipped_simulated.jpg and
+pictures, theirs, ours. And over their last twelve windows, how well an image tells where the next
+window's events fall (`metrics.event_correlation`), with the same events turned by 180 degrees for
+what chance gives. Writes results/shipped_weights.json, docs/shipped_simulated.jpg and
 docs/shipped_recordings.jpg.
 """
 
 import argparse
+import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +24,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from harness import save
+from harness import RESULTS, save
 from PIL import Image
 
 import firenet_jax as fj
@@ -40,6 +43,7 @@ HEIGHT, WIDTH, WINDOWS, JUDGED, BATCH, BATCHES = 180, 240, 40, 20, 2, 8
 SPEEDS = {"slow": (5.0, 50.0), "fast": (200.0, 1000.0)}
 SENSORS = {"clean": SensorSettings(), "faulty": replace(FAULTY, threshold_range=(0.1, 0.6))}
 SHOWN = 24  # windows into which a recording is cut, at least
+FOLLOWED = 12  # of them, after which events are compared with images
 
 
 def scores(images: np.ndarray, data) -> dict[str, float]:
@@ -110,8 +114,9 @@ def simulated(methods: dict) -> tuple[list[dict], np.ndarray]:
     return rows, np.concatenate(sheet)
 
 
-def recording_sheet(path: Path, methods: dict) -> Image.Image:
-    """Three windows of a recording: a row of event pictures, and one for each method."""
+def recording_sheet(path: Path, methods: dict) -> tuple[Image.Image, dict]:
+    """Three windows of a recording: a row of event pictures, and one for each method; and how well
+    each method's images tell where the next window's events fall."""
     about = describe(path)
     recording = fj.open_recording(path)
     count = min(about["events"] // SHOWN, round(0.35 * recording.height * recording.width))
@@ -122,7 +127,8 @@ def recording_sheet(path: Path, methods: dict) -> Image.Image:
     total = about["events"] // count
     wanted = {total // 2, total * 3 // 4, total - 1}
     rows = {name: [] for name in ("events", *methods)}
-    seen = 0
+    found = {name: [] for name in methods}
+    before, seen = {}, 0
     for tensors, _ in fj.event_tensors(recording, chunk=1, events=count):
         for name, weights in methods.items():
             state, shown = states[name]
@@ -131,6 +137,11 @@ def recording_sheet(path: Path, methods: dict) -> Image.Image:
             states[name] = state, shown
             if seen in wanted:
                 rows[name].append(np.repeat(np.asarray(pictures)[0, 0, ..., None], 3, -1))
+            if total - FOLLOWED <= seen < total:
+                votes = jnp.clip(tensors[0, 0].sum(-1), -3, 3)  # else hot pixels decide
+                both = jnp.stack([votes, votes[::-1, ::-1]])
+                found[name].append(metrics.event_correlation(jnp.stack([before[name]] * 2), both))
+            before[name] = images[0, 0]
         if seen in wanted:
             rows["events"].append(np.asarray(event_pictures(tensors))[0, 0])
         seen += 1
@@ -138,7 +149,12 @@ def recording_sheet(path: Path, methods: dict) -> Image.Image:
             break
     sheet = np.concatenate([np.concatenate(row, 1) for row in rows.values()])
     picture = Image.fromarray(sheet)
-    return picture.resize((540, round(540 * picture.height / picture.width)), Image.LANCZOS)
+    picture = picture.resize((540, round(540 * picture.height / picture.width)), Image.LANCZOS)
+    means = {}
+    for name, each in found.items():
+        after, turned = np.mean(each, 0).tolist()
+        means[name] = {"next": after, "turned": turned}
+    return picture, means
 
 
 def main():
@@ -153,11 +169,15 @@ def main():
         "ours": fj.load_weights(options.weights) if options.weights else fj.load_weights(),
     }
     DOCS.mkdir(exist_ok=True)
+    last = RESULTS / "shipped_weights.json"
+    results = json.loads(last.read_text()) if last.exists() else {}
     if options.recordings:
-        sheets = []
+        sheets, results["recordings"] = [], []
         for path in options.recordings:
-            print(path.name)
-            sheets.append(recording_sheet(path, methods))
+            sheet, found = recording_sheet(path, methods)
+            sheets.append(sheet)
+            results["recordings"].append({"recording": path.name, **found})
+            print(f"{path.name:30}", *(f"{name} {each}" for name, each in found.items()))
         columns = 3
         rows = [sheets[k : k + columns] for k in range(0, len(sheets), columns)]
         heights = [max(sheet.height for sheet in row) for row in rows]
@@ -172,8 +192,10 @@ def main():
         picture.resize((picture.width // 2, picture.height // 2)).save(
             DOCS / "shipped_simulated.jpg", quality=80
         )
-        pictures = [path.name for path in photographs(HELD_OUT)]
-        save("shipped_weights", {"pictures": pictures, "rows": rows})
+        results["pictures"] = [path.name for path in photographs(HELD_OUT)]
+        results["rows"] = rows
+    results.pop("machine", None)
+    save("shipped_weights", results)
 
 
 if __name__ == "__main__":

@@ -45,6 +45,10 @@ class Loss:
     """1 - SSIM after a soft histogram equalisation."""
     equalised_mse: float = 0.0
     """Mean squared difference after a soft histogram equalisation."""
+    detail: float = 0.0
+    """Difference between the local strengths of detail, of images before which next to nothing
+    moved: there the other distances prefer a blur to strokes that they cannot place. Blind to a
+    negative."""
     random_features: float = 0.0
     """Distance between the features of a random network."""
     lambda_tc: float = 2.0
@@ -56,11 +60,12 @@ class Loss:
     """Last image of a sequence, counted from 0."""
 
     def __post_init__(self):
-        for name in (*DISTANCES, "lambda_tc", "l0", "L"):
+        for name in (*DISTANCES, "detail", "lambda_tc", "l0", "L"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} is {getattr(self, name)}, but must be 0 or more")
 
 
+STILL = 0.3  # pixels by which nothing moves more before an image whose detail counts
 DISTANCES = {
     "l1": metrics.l1,
     "nlpd": metrics.nlpd,
@@ -98,7 +103,7 @@ def sequence_loss(
     images, truths: (T, B, H, W), image k is from the time of truth k, that of the last event.
     displacements: (T, B, H, W, 2) pixels, x then y, from image k-1 to k on the grid of k.
     visible: (T, B, H, W) bool, False where image k shows what image k-1 did not.
-    displacements[0] and visible[0] are not used: image 0 has no predecessor here.
+    displacements[0] and visible[0] are used by `detail` alone: image 0 has no predecessor here.
     warm: () bool, whether the state was warm before image 0, so that l0 does not apply.
 
     loss: scalar. Terms: scalars, unweighted means over batch and images (only those that count,
@@ -112,6 +117,10 @@ def sequence_loss(
             f"a sequence of {steps} images is longer than the L + 1 = {settings.L + 1} of the loss"
         )
     per_image, terms = reconstruction_loss(images, truths, settings)
+    if settings.detail:
+        moved = jnp.where(visible, jnp.abs(displacements).max(-1), 0.0).max((-2, -1))
+        terms["detail"] = jnp.where(moved < STILL, metrics.detail(images, truths), 0.0)
+        per_image += settings.detail * terms["detail"]
     terms = {"reconstruction": per_image, **terms}
     loss = per_image.sum(0).mean()
 

@@ -69,6 +69,9 @@ class SceneSettings:
     zoom: tuple[float, float] = (0.45, 1.1)
     """Pixels of the image for one pixel of a texture, drawn log-uniformly for each plane. Textures
     are blurred for that scale, so small ones do not flicker; above 1 they look unsharp."""
+    blur: tuple[float, float] = (0.5, 0.5)
+    """Standard deviation of the optics' blur in pixels of the image, drawn log-uniformly for each
+    scene; below 0.5 the finest texture flickers."""
     tilt: float = 0.3
     """Radians by which planes lean away from the camera, at most."""
     size: tuple[float, float] = (0.08, 0.3)
@@ -85,7 +88,7 @@ class SceneSettings:
     """How probable it is that a scene lies partly in deep shadow, 10 to 100 times darker."""
 
     def __post_init__(self):
-        for name in ("speed", "zoom", "size", "softness", "gamma"):
+        for name in ("speed", "zoom", "blur", "size", "softness", "gamma"):
             check_range(name, getattr(self, name))
         for name in ("pause", "still", "plain", "hdr"):
             if not 0 <= getattr(self, name) <= 1:
@@ -182,10 +185,10 @@ def random_scene(
     size = textures.shape[-1]
     chosen = textures[_whole(uniform((0.0, textures.shape[0]), (planes,)), textures.shape[0])]
     lit = _lit(light_key, chosen, settings)
-    # An optical blur of half a pixel keeps the picture free of aliasing; planes are seen up to a
-    # fifth farther away than at rest, and looking up bilinearly already blurs by 0.4 texture
-    # pixels.
-    sigma = jnp.sqrt(jnp.maximum((0.5 * 1.2 / zoom) ** 2 - 0.4**2, 1e-4))
+    # Half a pixel of blur keeps the picture free of aliasing; planes are seen up to a fifth farther
+    # away than at rest, and looking up bilinearly already blurs by 0.4 texture pixels.
+    blur = _dice(jax.random.fold_in(key, 1), 1)[1](settings.blur)
+    sigma = jnp.sqrt(jnp.maximum((blur * 1.2 / zoom) ** 2 - 0.4**2, 1e-4))
     canvases = jnp.clip(jax.vmap(_blurred)(lit, sigma), 0.0, 1.0)  # rounding may exceed 1
     origin = (size - 1) / 2 + uniform((-0.15, 0.15), (planes, 2)) * size
 

@@ -39,6 +39,7 @@ TICKS = 1024  # in a microsecond
 AT_ONCE = 4  # events of a pixel in one pass over the picture: fewer passes, less memory traffic
 LONGEST = 2**31 // TICKS - 1  # microseconds between two renderings
 SLOW, SWIFT = (0.02, 0.3), (16.0, 90.0)  # pixels a window, of rare sequences
+UNEVEN = 4.0  # times the mismatch of others: pixels of one edge fire one by one, not together
 CALM = 2 / 3  # of the slow ones: next to no faults, so that single events can be trusted
 
 
@@ -544,8 +545,9 @@ def random_setups(
 
     The windows of a sequence all last equally long: so that at its fastest time the fastest point
     moves by so many pixels as `motion` says (least, greatest; log-uniform), but 1 to 300 ms.
-    slow, swift: parts of the sequences in which next to nothing moves (`SLOW` pixels a window, in
-    most of these with a fiftieth of noise and leaks), and in which much does before a blank ground
+    slow, swift: parts of the sequences in which next to nothing moves (`SLOW` pixels a window, the
+    pixels' thresholds differ `UNEVEN` times as much, and most have a fiftieth of noise and leaks),
+    and in which much does before a blank ground
     (`SWIFT` pixels, from one rendering to the next by more than one).
     Raises ValueError where `motion` is more than a pixel from one rendering to the next, the bound
     of Gehrig et al., "Video to Events", CVPR 2020, or slow and swift leave nothing.
@@ -581,6 +583,14 @@ def random_setups(
     one_sensor = partial(random_sensor, settings=sensor, **size)
     sensors = jax.vmap(one_sensor)(jax.random.split(sensor_key, batch))
     if slow:
+        apart = jnp.where(is_slow, UNEVEN, 1.0)[:, None, None]
+
+        def uneven(thresholds):
+            mean = thresholds.mean((-2, -1), keepdims=True)
+            return jnp.maximum(mean + apart * (thresholds - mean), 0.01)
+
+        if sensors.on.ndim == 3:  # else all pixels of a sequence have one
+            sensors = sensors._replace(on=uneven(sensors.on), off=uneven(sensors.off))
         calm = jnp.where(kind < CALM * slow, 0.02, 1.0)
         if sensors.noise is not None:
             sensors = sensors._replace(noise=sensors.noise * calm)

@@ -146,6 +146,25 @@ def test_every_weight_has_its_term():
     assert blank.shape == (2,) and not terms
 
 
+def test_detail_counts_where_next_to_nothing_moved_and_what_cannot_be_seen_does_not_move():
+    images, truths, displacements, visible = sequence(3)
+    displacements *= 0.01
+    displacements[0, 0, 5, 5] = 0.0, -0.4
+    displacements[1, 1, 7, 7] = np.nan
+    displacements[2, :, 3, 3] = 2.0
+    visible[:] = True
+    visible[1, 1, 7, 7] = visible[2, 1, 3, 3] = False
+    settings = replace(NOTHING, l1=1.0, detail=10.0)
+    loss, terms = jitted(settings)(images, truths, displacements, visible)
+    each = np.array([[references.detail(*pair) for pair in zip(*rows, strict=True)]
+                     for rows in zip(images, truths, strict=True)])  # fmt: skip
+    each[0, 0] = each[2, 0] = 0
+    np.testing.assert_allclose(terms["detail"], each.mean(), rtol=1e-3)
+    without, _ = jitted(replace(settings, detail=0.0))(images, truths, displacements, visible)
+    np.testing.assert_allclose(loss - without, 10 * each.sum(0).mean(), rtol=1e-3)
+    np.testing.assert_allclose(3 * terms["reconstruction"], loss, rtol=1e-5)
+
+
 def test_gradients_are_finite_for_flat_equal_and_saturated_sequences():
     _, truths, displacements, visible = sequence()
     displacements[~visible] = np.nan

@@ -24,6 +24,7 @@ DISTANCES = {
     "l1": (metrics.l1, lambda image, truth: np.abs(image - truth).mean()),
     "nlpd": (metrics.nlpd, references.nlpd),
     "gmsd": (metrics.gmsd, references.gmsd),
+    "detail": (metrics.detail, references.detail),
     "equalised_mse": (metrics.equalised_mse, references.equalised_mse),
     "random_features": (
         metrics.random_features,
@@ -31,7 +32,7 @@ DISTANCES = {
     ),
 }
 ALL = SIMILARITIES | DISTANCES
-BLIND_TO_A_NEGATIVE = {"gmsd", "haarpsi", "cw_ssim"}
+BLIND_TO_A_NEGATIVE = {"gmsd", "haarpsi", "cw_ssim", "detail"}
 
 
 def texture(seed, height=H, width=W):
@@ -159,6 +160,15 @@ def test_equalised_ssim_ignores_tone_and_sees_faint_texture():
     faint, flat = 0.5 + 0.05 * (truth - 0.5), np.full_like(truth, 0.5)
     assert (metrics.ssim(flat, faint) > 0.9).all()  # its constants hide what is lost
     assert (metrics.equalised_ssim(flat, faint) < 0.6).all()
+
+
+def test_detail_asks_how_much_there_is_and_not_where():
+    """Strokes in the wrong places are better than none; L1 says the opposite."""
+    truth, other = (np.float32(np.random.default_rng(seed).random((H, W)) > 0.9) for seed in (1, 2))
+    blurred = gaussian_filter(truth, 3)
+    assert metrics.detail(other, truth) < 0.3 * metrics.detail(blurred, truth)
+    assert metrics.l1(other, truth) > metrics.l1(blurred, truth)
+    np.testing.assert_allclose(metrics.detail(other + 0.3, other), 0, atol=1e-5)
 
 
 def extremes():
@@ -301,3 +311,46 @@ def test_wrong_sizes_are_refused():
         metrics.ssim(np.zeros((10, 30)), np.zeros((10, 30)))
     with pytest.raises(ValueError, match="MS-SSIM needs"):
         metrics.ms_ssim(np.zeros((10, 30)), np.zeros((10, 30)))
+
+
+def shifted(picture, pixels):
+    """Moved to the right by a part of a pixel, by the Fourier shift theorem."""
+    ramp = np.exp(-2j * np.pi * np.fft.fftfreq(picture.shape[1]) * pixels)
+    return np.float32(np.fft.ifft(np.fft.fft(picture, axis=1) * ramp, axis=1).real)
+
+
+def test_event_correlation_equals_least_squares_block_by_block():
+    rng = np.random.default_rng(13)
+    image, votes = texture(14), np.float32(rng.integers(-2, 3, (H, W)))
+    smooth, events = (gaussian_filter(np.float64(a), 0.7, radius=3) for a in (image, votes))
+    slopes = np.pad(smooth, 1, "edge")
+    slopes = (slopes[2:, 1:-1] - slopes[:-2, 1:-1], slopes[1:-1, 2:] - slopes[1:-1, :-2])
+    fit = total = 0.0
+    for top in range(0, H - 13, 14):
+        for left in range(0, W - 13, 14):
+            block = np.s_[top : top + 14, left : left + 14]
+            matrix = np.stack([slope[block].ravel() for slope in slopes], -1)
+            velocity = np.linalg.lstsq(matrix, events[block].ravel())[0]
+            fit += ((matrix @ velocity) ** 2).sum()
+            total += (events[block] ** 2).sum()
+    actual = metrics.event_correlation(np.stack([image, 1 - 3 * image]), np.stack([votes] * 2))
+    np.testing.assert_allclose(actual, (fit / total) ** 0.5, rtol=1e-3)
+
+
+def test_event_correlation_prefers_the_image_that_moved():
+    """To its blurred, its noisy and its displaced version, and to one that is something else."""
+    noise = np.random.default_rng(15).standard_normal((3, 84, 98))
+    image, other = gaussian_filter(noise[:2], (0, 1.5, 1.5), mode="wrap")
+    votes = shifted(image, 0.25) - shifted(image, -0.25)
+    noisy = image + 0.7 * image.std() * noise[2]
+    others = [gaussian_filter(image, 2, mode="wrap"), noisy, np.roll(image, 2, 0), other]
+    others = np.float32(np.stack([image, *others]))
+    own, *worse, chance = metrics.event_correlation(others, np.stack([votes] * 5))
+    assert own > 0.99
+    assert (np.array(worse) < 0.9).all() and (np.array(worse) > chance).all()
+    assert chance < 0.5
+    blank = np.zeros_like(image)
+    assert metrics.event_correlation(blank, votes) < 1e-3
+    assert metrics.event_correlation(image, blank) == 0
+    with pytest.raises(ValueError, match="14x14 pixels at least"):
+        metrics.event_correlation(image[:13], votes[:13])

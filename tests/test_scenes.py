@@ -142,6 +142,22 @@ def test_textures_are_blurred_for_the_scale_at_which_they_are_seen():
     assert spectrum[kept].sum() > 0.6 * before[kept].sum()
 
 
+def test_less_blur_leaves_finer_detail():
+    """The same scene but for the blur: so much more of what is finer than four pixels."""
+    textures = np.random.default_rng(2).random((2, 128, 128)).astype(np.float32)
+
+    def fine(blur):
+        settings = SceneSettings(objects=0, zoom=(0.5, 0.5), blur=(blur, blur))
+        size = {"height": 48, "width": 64}
+        scene = module.random_scene(jax.random.key(4), textures, settings=settings, **size)
+        image = np.asarray(module.render(scene, 0.0, **size).image)
+        frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(64), np.fft.fftfreq(48)))
+        return (np.abs(np.fft.fft2(image))[frequency > 0.25] ** 2).sum()
+
+    strengths = [fine(blur) for blur in (0.3, 0.5, 0.8)]
+    assert strengths[0] > 1.5 * strengths[1] > 3 * strengths[2]
+
+
 def test_a_magnified_texture_is_looked_up_as_numpy_would(still):
     """A plane that faces the camera, its texture a ramp, one texture pixel in two of the image."""
     size = still.textures[0].shape[-1]
@@ -343,6 +359,7 @@ def test_video_gives_each_time_its_picture(scenes):
     [
         ({"speed": (0.0, 100.0)}, "speed is 0 100, but is drawn log-uniformly"),
         ({"zoom": (1.0, 0.5)}, "the least first"), ({"pause": 1.5}, "a probability"),
+        ({"blur": (0.0, 0.5)}, "more than 0"),
         ({"objects": -1}, "objects is -1"), ({"tilt": -0.1}, "tilt"),
         ({"white": (0.9, 2.0)}, "white is 0.9 2"),
     ],

@@ -542,6 +542,14 @@ def test_rare_sequences_are_slow_and_calm_or_swift_before_a_blank_ground(texture
     np.testing.assert_array_equal(blank, swift)
     calm = np.asarray(sensors.noise) < 0.5
     assert not calm[~slow].any() and 0.4 < calm[slow].mean() < 0.9
+    even, _, _ = make(slow=1e-9, swift=0.2)
+    for name in ("on", "off"):
+        thresholds, before = (np.asarray(getattr(sensor, name)) for sensor in (sensors, even))
+        spread, mean = before.std((1, 2)), before.mean((1, 2), keepdims=True)
+        np.testing.assert_array_equal(thresholds[~slow], before[~slow])
+        farther = np.maximum(mean + 4 * (before - mean), 0.01)
+        np.testing.assert_allclose(thresholds[slow], farther[slow], rtol=1e-4)
+        assert (0.02 < spread).all() and (spread < 0.04).all()
     with pytest.raises(ValueError, match="together less than 1"):
         make(slow=0.6, swift=0.4)
 
