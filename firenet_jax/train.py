@@ -128,7 +128,8 @@ class Train:
     """Pixels by which the fastest point moves in a window, at most one for a rendering; drawn
     log-uniformly for a sequence."""
     slow: float = 0.0
-    """Part of the sequences in which next to nothing moves, most of them with next to no noise."""
+    """Part of the sequences in which next to nothing moves: there the thresholds of pixels differ
+    more, and most have next to no noise."""
     swift: float = 0.0
     """Part of the sequences in which 16 to 90 pixels pass in a window, before a blank ground."""
     learning_rate: float = 1e-3
