@@ -2,8 +2,8 @@
 
     python experiments/readme_picture.py WEIGHTS RECORDING...          seconds
 
-Each recording is cut into 25 windows and one of its last pictures is taken, cropped to 4:3 and
-scaled to one height. Writes docs/events_to_video.png.
+Of what `firenet reconstruct RECORDING -o FOLDER --preview` gives, one of the last pictures of each
+recording, cropped to 4:3 and scaled to one height. Writes docs/events_to_video.png.
 """
 
 import argparse
@@ -13,10 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from firenet_jax.info import describe
-from firenet_jax.pictures import Display
 from firenet_jax.pipeline import Reconstruct, run
-from firenet_jax.windows import Windows
 
 OUT = Path(__file__).parents[1] / "docs" / "events_to_video.png"
 HEIGHT = 180
@@ -24,14 +21,9 @@ HEIGHT = 180
 
 def last_picture(recording: Path, weights: Path) -> Image.Image:
     """Events above, reconstruction below."""
-    windows = Windows(events=describe(recording)["events"] // 24)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out"
-        run(
-            Reconstruct(
-                (recording,), out, weights, windows, display=Display(auto_range=True), preview=True
-            )
-        )
+        run(Reconstruct((recording,), out, weights, preview=True))
         with Image.open(sorted(out.glob("frame_*.png"))[-2]) as picture:
             pixels = np.asarray(picture)
     events, image = np.split(pixels, 2, axis=1)

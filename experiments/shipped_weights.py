@@ -8,8 +8,8 @@ last 20 of 40 windows of 16 sequences of 240x180, and the standard error of thei
 published weights', over pairs of sequences. Losses, stages and the mean of weights were chosen by
 these pictures: they validate, an untouched test they are not. Local equalisation is that of
 `equalise`.
-Recordings: three windows of each after warming up, the same windows for both networks; event
-pictures, theirs, ours. And over their last twelve windows, how well an image tells where the next
+Recordings: three windows of each after warming up, the same windows for both networks, as
+`firenet reconstruct RECORDING -N EVENTS` shows them; event pictures, theirs, ours. And over their last twelve windows, how well an image tells where the next
 window's events fall (`metrics.event_correlation`), with the same events turned by 180 degrees for
 what chance gives. Writes results/shipped_weights.json, docs/shipped_simulated.jpg and
 docs/shipped_recordings.jpg.
@@ -32,7 +32,7 @@ from firenet_jax import metrics
 from firenet_jax.equalise import equalise
 from firenet_jax.info import describe
 from firenet_jax.network import initial_state
-from firenet_jax.pictures import Display, display, event_pictures, initial_display_state
+from firenet_jax.pictures import display, event_pictures, initial_display_state
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.scenes import SceneSettings
 from firenet_jax.sensor import FAULTY, SensorSettings, sequences
@@ -133,7 +133,7 @@ def recording_sheet(path: Path, methods: dict) -> tuple[Image.Image, dict]:
         for name, weights in methods.items():
             state, shown = states[name]
             state, images = reconstruct(weights, state, tensors)
-            shown, pictures = display(shown, images, settings=Display(auto_range=True))
+            shown, pictures = display(shown, images)
             states[name] = state, shown
             if seen in wanted:
                 rows[name].append(np.repeat(np.asarray(pictures)[0, 0, ..., None], 3, -1))

@@ -273,6 +273,45 @@ DETAIL = replace(
     scene=replace(NOISE.scene, blur=(0.35, 0.5)),
     sensor=replace(NOISE.sensor, mismatch=0.03),
 )
+# Recordings of any length: sequences of up to 800 windows, with pauses of up to a hundred, of all
+# ages in each step. Thresholds near one value, as events tell contrast in units of the threshold
+# alone: where it may be anything, a loss that seeks the mean is best answered in grey. For contrast
+# also less weight on flicker and a term of its own. It began from the built-in weights of before.
+AGES = replace(
+    DETAIL,
+    batch=3,
+    steps=1300,
+    chain=40,
+    renderings=10,
+    motion=(0.3, 10.0),
+    slow=0.1,
+    swift=0.03,
+    learning_rate=8e-4,
+    warmup=30,
+    seed=111,
+    validate_every=250,
+    loss=Loss(
+        l1=0.3,
+        centred=1.0,
+        contrast=1.0,
+        nlpd=0.5,
+        ssim=1.0,
+        haarpsi=0.5,
+        equalised=0.7,
+        equalised_mse=8.0,
+        detail=20.0,
+        lambda_tc=2.0,
+    ),
+    scene=replace(NOISE.scene, pause=0.3, plain=0.15, blur=(0.35, 0.5)),
+    sensor=replace(
+        NOISE.sensor,
+        threshold_range=(0.14, 0.26),
+        asymmetry=0.12,
+        noise=(1e-3, 3.0),
+        leak=(1e-3, 0.3),
+        hot=(1e-7, 5e-4),
+    ),
+)
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
@@ -292,6 +331,7 @@ STAGES = {
     "noise": (NOISE, None),
     "still": (STILL, None),
     "detail": (DETAIL, None),
+    "ages": (AGES, None),
 }
 # Parts of a mean: what a stage starts from, if not from the one before; the built-in weights.
 FIRST = {"even": 1, "usual": 1, "settle": 1, "natural": 9}

@@ -24,11 +24,16 @@ class Loss:
     """The weights of Eq. 2; a term of weight 0 is not computed.
 
     The default did best in experiments/compare_losses.py.
-    gmsd, haarpsi and cw_ssim cannot tell an image from its negative: never use them alone.
+    gmsd, haarpsi, cw_ssim and contrast cannot tell an image from its negative: never use them alone.
     """
 
     l1: float = 1.0
     """Mean absolute difference."""
+    centred: float = 0.0
+    """Mean absolute difference of images without their means: events tell no absolute brightness,
+    so most of its gradient is noise."""
+    contrast: float = 0.0
+    """Difference of the standard deviations; blind to a negative."""
     nlpd: float = 0.5
     """Normalised Laplacian pyramid distance."""
     ssim: float = 0.0
@@ -68,6 +73,8 @@ class Loss:
 STILL = 0.3  # pixels by which nothing moves more before an image whose detail counts
 DISTANCES = {
     "l1": metrics.l1,
+    "centred": metrics.centred,
+    "contrast": metrics.contrast,
     "nlpd": metrics.nlpd,
     "ssim": lambda image, truth: 1 - metrics.ssim(image, truth),
     "ms_ssim": lambda image, truth: 1 - metrics.ms_ssim(image, truth),
@@ -104,7 +111,7 @@ def sequence_loss(
     displacements: (T, B, H, W, 2) pixels, x then y, from image k-1 to k on the grid of k.
     visible: (T, B, H, W) bool, False where image k shows what image k-1 did not.
     displacements[0] and visible[0] are used by `detail` alone: image 0 has no predecessor here.
-    warm: () bool, whether the state was warm before image 0, so that l0 does not apply.
+    warm: () or (B,) bool, whether the state was warm before image 0, so that l0 does not apply.
 
     loss: scalar. Terms: scalars, unweighted means over batch and images (only those that count,
     for "temporal"), so that they compare between lengths; "reconstruction" is the mean of L_R:
@@ -137,10 +144,12 @@ def sequence_loss(
             truths[before],
             visible[now],
         )  # (T - first, B)
-        counted = jnp.ones(len(errors))
+        counted = jnp.ones(errors.shape)
         if not known:
-            counted = (warm | (jnp.arange(first, steps) >= settings.l0)).astype(jnp.float32)
-        total = counted @ errors.mean(1)
+            warm = jnp.broadcast_to(warm, errors.shape)
+            late = (jnp.arange(first, steps) >= settings.l0)[:, None]
+            counted = jnp.where(warm, True, jnp.broadcast_to(late, errors.shape)).astype(float)
+        total = (counted * errors).sum(0).mean()
         loss += settings.lambda_tc * total
-        terms["temporal"] = total / jnp.maximum(counted.sum(), 1)
+        terms["temporal"] = total / jnp.maximum(counted.sum(0).mean(), 1)
     return loss, {name: term.mean() for name, term in terms.items()}

@@ -99,6 +99,32 @@ def l1(image: jax.Array, truth: jax.Array) -> jax.Array:
     return _mean(jnp.abs(image - truth))
 
 
+@jax.jit
+def centred(image: jax.Array, truth: jax.Array) -> jax.Array:
+    """Mean absolute difference of images without their means: events tell no absolute brightness.
+
+    Sees a negative.
+    """
+    image, truth = _compared(image, truth)
+    difference = image - truth
+    return _mean(jnp.abs(difference - _mean(difference)[..., None, None]))
+
+
+@jax.jit
+def contrast(image: jax.Array, truth: jax.Array) -> jax.Array:
+    """Distance of the standard deviations over all pixels. Blind to a negative, and to places.
+
+    A distance that seeks the mean is best answered in grey wherever a network is not sure; this one
+    asks for as much black and white as there is.
+    """
+    image, truth = _compared(image, truth)
+
+    def deviation(picture):
+        return _root(_mean((picture - _mean(picture)[..., None, None]) ** 2))
+
+    return jnp.abs(deviation(image) - deviation(truth))
+
+
 @partial(jax.jit, static_argnames="data_range")
 def psnr(image: jax.Array, truth: jax.Array, *, data_range: float = 1.0) -> jax.Array:
     """10 log10(range^2 / MSE) in dB; infinite, with gradient 0, for equal images."""

@@ -88,6 +88,9 @@ class SensorSettings:
     """Hertz: bandwidth of the pixels, a first-order low-pass on log intensity."""
     cutoff_dark: float = 0.1
     """Bandwidth in the dark, in parts of that in full light; 1: it depends on no light."""
+    mid_recording: bool = False
+    """The sensor has run before: each pixel's reference begins anywhere within a threshold of the
+    first rendering, instead of on it."""
 
     def __post_init__(self):
         for name in ("threshold_range", "refractory_range"):
@@ -152,6 +155,7 @@ class Sensor(NamedTuple):
     cutoff: jax.Array | None  # (2,) hertz in full light, and the part of it left in the dark
     phase: jax.Array | None  # (H, W) part of the first threshold already gone, where L drifts, and
     # whether noise begins with ON: else all pixels would begin with the same event
+    start: jax.Array | None  # (H, W) L above the reference at the first rendering
     key: jax.Array  # of the noise
 
 
@@ -212,6 +216,9 @@ def random_sensor(
         if _on(settings.hot):
             rate = 10.0 * 50.0**rate * jnp.where(sign < 0.5, on, -off)
             drift = jnp.where(chance < log_uniform(settings.hot), rate, drift)
+    start = None
+    if settings.mid_recording:
+        start = jax.random.uniform(jax.random.fold_in(key, 1), shape, minval=-off, maxval=on)
     refractory = _or(settings.refractory, REFRACTORY)
     refractory = jnp.float32(refractory) if refractory else None
     if settings.refractory_range is not None:
@@ -228,6 +235,7 @@ def random_sensor(
         if _on(settings.cutoff)
         else None,
         phase=phase,
+        start=start,
         key=noise_key,
     )
 
@@ -243,6 +251,8 @@ def first_state(sensor: Sensor, image: jax.Array) -> SensorState:
     if sensor.drift is not None:
         drifted = jnp.where(sensor.drift > 0, sensor.on, -sensor.off) * sensor.phase
         above = jnp.where(sensor.drift != 0, drifted, above)
+    if sensor.start is not None:
+        above = sensor.start
     silent = None if sensor.refractory is None else jnp.zeros(image.shape, jnp.int32)
     # A later bit of the phase than those that say when a pixel leaks.
     noise_on = None if sensor.noise is None else sensor.phase * 1024 % 2 < 1
@@ -515,7 +525,6 @@ def check_rare(slow: float, swift: float) -> None:
     jax.jit,
     static_argnames=(
         "batch",
-        "windows",
         "height",
         "width",
         "renderings",
@@ -531,7 +540,7 @@ def random_setups(
     textures: jax.Array,
     *,
     batch: int,
-    windows: int,
+    windows: int | jax.Array,
     height: int,
     width: int,
     renderings: int = 5,
@@ -541,10 +550,12 @@ def random_setups(
     scene: SceneSettings = SceneSettings(),
     sensor: SensorSettings = SensorSettings(),
 ) -> tuple[Sensor, Scene, jax.Array]:
-    """key, textures (N, S, S) -> sensors, scenes, bounds: B random setups for `simulate`.
+    """key, textures (N, S, S) -> sensors, scenes, durations: B random setups for `simulate`.
 
-    The windows of a sequence all last equally long: so that at its fastest time the fastest point
-    moves by so many pixels as `motion` says (least, greatest; log-uniform), but 1 to 300 ms.
+    durations: (B,) int32 microseconds, what each window of a sequence lasts: so that at its fastest
+    time the fastest point moves by so many pixels as `motion` says (least, greatest; log-uniform),
+    but 1 to 300 ms.
+    windows: in a sequence, over which pauses are placed and the speed is measured.
     slow, swift: parts of the sequences in which next to nothing moves (`SLOW` pixels a window, the
     pixels' thresholds differ `UNEVEN` times as much, and most have a fiftieth of noise and leaks),
     and in which much does before a blank ground
@@ -601,8 +612,16 @@ def random_setups(
         grey = jax.random.uniform(grey_key, (batch, 1, 1), minval=0.2, maxval=0.8)
         ground = jnp.where(is_swift[:, None, None], grey, scenes.textures[0])
         scenes = scenes._replace(textures=(ground, *scenes.textures[1:]))
-    bounds = jnp.arange(windows + 1, dtype=jnp.int32)[:, None] * duration[None]
-    return sensors, scenes, bounds
+    return sensors, scenes, duration
+
+
+def window_bounds(durations: jax.Array, windows: int, first: jax.Array | int = 0) -> jax.Array:
+    """Durations (B,) -> (windows + 1, B) int32 microseconds, of the windows from `first` on.
+
+    first: () or (B,) int32.
+    """
+    first = jnp.broadcast_to(first, durations.shape)
+    return (first[None] + jnp.arange(windows + 1, dtype=jnp.int32)[:, None]) * durations[None]
 
 
 def sequences(
@@ -616,5 +635,6 @@ def sequences(
 ) -> Simulation:
     """key, textures (N, S, S) -> training data; `settings` are those of `random_setups`."""
     shared = {"height": height, "width": width, "renderings": renderings}
-    setups = random_setups(key, textures, **shared, **settings)
-    return simulate(*setups, **shared)[1]
+    sensors, scenes, durations = random_setups(key, textures, **shared, **settings)
+    bounds = window_bounds(durations, settings["windows"])
+    return simulate(sensors, scenes, bounds, **shared)[1]

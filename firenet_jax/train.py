@@ -1,8 +1,10 @@
 """Simulated sequences, or files of them -> parameters: a jitted step simulates, scans, updates.
 
-With `chain` more than 1 the steps of a chain see one long sequence, one part after the other
-(truncated back-propagation): simulation and network go on from the states where the last step
-left them, gradients stop there.
+With `chain` more than 1 a sequence goes on through so many steps (truncated back-propagation
+through time): simulation and network go on from the states where the last step left them,
+gradients stop there. The sequences of a batch are of different lengths, up to `chain` steps, so
+that each step sees states of many ages: what a recurrence does after a thousand windows is learnt
+from states that are as old, what it does at first from such as begin.
 
 Step n is a function of the seed, n and the state alone, so a run that was interrupted and resumed
 is the run that was not. A run is a folder:
@@ -78,6 +80,7 @@ from firenet_jax.sensor import (
     first_states,
     random_setups,
     simulate,
+    window_bounds,
 )
 from firenet_jax.tensors import normalise
 from firenet_jax.textures import load_textures
@@ -121,7 +124,8 @@ class Train:
     windows: int = 21
     """Windows in a step, L + 1 in the paper."""
     chain: int = 1
-    """Steps through which a sequence goes on, its state carried from one to the next."""
+    """Steps through which the longest sequence of a batch goes on, its state carried from one to
+    the next; the others are shorter, in equal proportions (64 with 4 sequences: 3, 8, 23, 64)."""
     renderings: int = 5
     """Renderings in a window."""
     motion: tuple[float, float] = (1.25, 2.5)
@@ -251,8 +255,9 @@ def initial_train_state(settings: Train) -> TrainState:
         params = weights.params
     carried = None
     if settings.chain > 1:
+        ones = jnp.ones(settings.batch, jnp.int32)
         setups = jax.eval_shape(
-            partial(_setups, settings=settings, chain=1),
+            partial(_setups, settings=settings, lengths=ones, numbers=ones),
             jax.random.key(0),
             jnp.zeros((1, TEXTURE, TEXTURE)),
         )
@@ -277,29 +282,45 @@ def _keys(settings: Train) -> list[jax.Array]:
 # ---- Simulation
 
 
-def _setups(key: jax.Array, textures: jax.Array, settings: Train, chain: int):
-    """Sensors, scenes and bounds of all windows of a chain."""
-    return random_setups(
-        key,
-        textures,
-        batch=settings.batch,
-        windows=chain * settings.windows,
-        height=settings.crop,
-        width=settings.crop,
-        renderings=settings.renderings,
-        motion=settings.motion,
-        slow=settings.slow,
-        swift=settings.swift,
-        scene=settings.scene,
-        sensor=settings.sensor,
-    )
+def _lengths(settings: Train) -> np.ndarray:
+    """(B,) steps through which each sequence of a batch goes on."""
+    shares = np.arange(1, settings.batch + 1) / settings.batch
+    return np.round(settings.chain**shares).astype(np.int32)
 
 
-def _fresh(sensors, scenes, bounds, settings: Train) -> tuple[SensorState, State]:
-    """What a sequence starts from."""
+def _setups(
+    key: jax.Array, textures: jax.Array, settings: Train, lengths: jax.Array, numbers: jax.Array
+):
+    """Sensors, scenes and durations of a window, leading axis B, of sequences so many steps long.
+
+    numbers: (B,) int32, how many sequences there were before in the same place of the batch.
+    """
+
+    def one(place, length, number):
+        setup = random_setups(
+            jax.random.fold_in(jax.random.fold_in(key, place), number),
+            textures,
+            batch=1,
+            windows=length * settings.windows,
+            height=settings.crop,
+            width=settings.crop,
+            renderings=settings.renderings,
+            motion=settings.motion,
+            slow=settings.slow,
+            swift=settings.swift,
+            scene=settings.scene,
+            sensor=settings.sensor,
+        )
+        return jax.tree.map(lambda leaf: leaf[0], setup)
+
+    return jax.vmap(one)(jnp.arange(settings.batch), lengths, numbers)
+
+
+def _fresh(sensors, scenes, start, settings: Train) -> tuple[SensorState, State]:
+    """What sequences start from at (B,) int32 microseconds."""
     size = settings.crop, settings.crop
-    seen = first_states(sensors, scenes, bounds[0], height=size[0], width=size[1])
-    return seen, initial_state(bounds.shape[1], *size)
+    seen = first_states(sensors, scenes, start, height=size[0], width=size[1])
+    return seen, initial_state(len(start), *size)
 
 
 def _simulated(
@@ -307,28 +328,29 @@ def _simulated(
 ) -> tuple[Simulation, tuple[SensorState, State], jax.Array | bool]:
     """A step's data, the states (sensor's after it, network's before it), whether these are warm.
 
-    Without a TrainState: a sequence of its own.
+    Without a TrainState: sequences of their own.
     """
-    chain = 1 if state is None else settings.chain
-    sensors, scenes, bounds = _setups(key, textures, settings, chain)
-    part = jnp.int32(0) if chain == 1 else state.step % chain
-    carried = None if chain == 1 else state.carried
+    chained = state is not None and settings.chain > 1
+    lengths = jnp.asarray(_lengths(settings) if chained else np.ones(settings.batch, np.int32))
+    step = jnp.int32(0) if state is None else state.step
+    numbers, parts = step // lengths, step % lengths
+    sensors, scenes, durations = _setups(key, textures, settings, lengths, numbers)
+    bounds = window_bounds(durations, settings.windows, parts * settings.windows)
+    carried = state.carried if chained else None
 
-    def one_device(sensors, scenes, bounds, carried, part):
-        seen, remembered = _fresh(sensors, scenes, bounds, settings)
-        if chain > 1:
-            choose = partial(jnp.where, part > 0)
-            seen, remembered = jax.tree.map(choose, carried, (seen, remembered))
-            first = part * settings.windows
-            bounds = jax.lax.dynamic_slice_in_dim(bounds, first, settings.windows + 1)
+    def one_device(sensors, scenes, bounds, carried, parts):
+        seen, remembered = _fresh(sensors, scenes, bounds[0], settings)
+        if chained:
+            choose = jax.vmap(partial(jnp.where))
+            seen, remembered = jax.tree.map(partial(choose, parts > 0), carried, (seen, remembered))
         size = {"height": settings.crop, "width": settings.crop}
         seen, data = simulate(sensors, scenes, bounds, seen, renderings=settings.renderings, **size)
         return data, (seen, remembered)
 
-    specs = BATCH, BATCH, TIME_BATCH, BATCH, EVERYWHERE
+    specs = BATCH, BATCH, TIME_BATCH, BATCH, BATCH
     on_each = on_each_device(one_device, specs, (TIME_BATCH, BATCH))
-    data, states = on_each(sensors, scenes, bounds, carried, part)
-    return data, states, part > 0 if chain > 1 else False
+    data, states = on_each(sensors, scenes, bounds, carried, parts)
+    return data, states, parts > 0 if chained else False
 
 
 # ---- Steps
@@ -367,7 +389,7 @@ def loss_of(params, data: Simulation, state: State | None, warm, settings: Train
     # A `warm` that is known, known it must stay: it is no argument of the program then.
     known = isinstance(warm, bool)
     function = partial(one_device, warm=warm) if known else one_device
-    specs = (EVERYWHERE, TIME_BATCH, BATCH) + (() if known else (EVERYWHERE,))
+    specs = (EVERYWHERE, TIME_BATCH, BATCH) + (() if known else (BATCH,))
     on_each = on_each_device(function, specs, (EVERYWHERE, (BATCH, TIME_BATCH)))
     (loss, terms), (last, images) = on_each(params, data, state, *(() if known else (warm,)))
     return loss, (terms, last, images)
@@ -397,11 +419,11 @@ def train_step(
         size = data.images.shape[1:]
         before = initial_state(*size)
         if settings.chain > 1:
-            warm = state.step % settings.chain > 0
-            before = jax.tree.map(partial(jnp.where, warm), state.carried[1], before)
+            later = state.step % settings.chain > 0
+            before = jax.tree.map(partial(jnp.where, later), state.carried[1], before)
+            warm = jnp.broadcast_to(later, settings.batch)
     else:
         key, textures = source
-        key = jax.random.fold_in(key, state.step // settings.chain)
         data, (seen, before), warm = _simulated(key, textures, settings, state)
     state, terms, last = _updated(state, data, before, warm, settings)
     return state._replace(carried=(seen, last) if settings.chain > 1 else None), terms

@@ -120,7 +120,16 @@ def test_a_perfect_reconstruction_of_a_moving_picture_costs_nothing():
     )
 
 
-SIGHTED = ("l1", "nlpd", "ssim", "ms_ssim", "equalised", "equalised_mse", "random_features")
+SIGHTED = (
+    "l1",
+    "centred",
+    "nlpd",
+    "ssim",
+    "ms_ssim",
+    "equalised",
+    "equalised_mse",
+    "random_features",
+)
 
 
 @pytest.mark.parametrize("names", [("l1", "nlpd", "haarpsi"), *((name,) for name in SIGHTED)])
@@ -210,3 +219,17 @@ def test_whether_the_state_is_warm_may_be_known_only_as_the_program_runs():
         for loss, found in (compiled(warm), sequence_loss(*arguments, settings, warm)):
             np.testing.assert_allclose(loss, expected, rtol=1e-5)
             np.testing.assert_allclose(found["temporal"], terms["temporal"], rtol=1e-5)
+
+
+def test_some_sequences_may_be_warm_and_others_not():
+    """Each counts as if it were alone; the loss is the mean over the batch."""
+    arguments, settings = sequence(), replace(NOTHING, l1=0.3, lambda_tc=1.5, l0=2, L=4)
+    batch = arguments[0].shape[1]
+    warm = np.arange(batch) % 2 == 0
+    loss, _ = sequence_loss(*arguments, settings, jnp.asarray(warm))
+    alone = [
+        sequence_loss(*(a[:, b : b + 1] for a in arguments), settings, bool(warm[b]))[0]
+        for b in range(batch)
+    ]
+    assert batch > 1 and not np.isclose(alone[0], alone[1])
+    np.testing.assert_allclose(loss, np.mean(alone), rtol=1e-5)

@@ -22,6 +22,11 @@ SIMILARITIES = {
 DISTANCES = {
     "mse": (metrics.mse, mean_squared_error),
     "l1": (metrics.l1, lambda image, truth: np.abs(image - truth).mean()),
+    "centred": (
+        metrics.centred,
+        lambda image, truth: np.abs((image - image.mean()) - (truth - truth.mean())).mean(),
+    ),
+    "contrast": (metrics.contrast, lambda image, truth: abs(np.std(image) - np.std(truth))),
     "nlpd": (metrics.nlpd, references.nlpd),
     "gmsd": (metrics.gmsd, references.gmsd),
     "detail": (metrics.detail, references.detail),
@@ -32,7 +37,7 @@ DISTANCES = {
     ),
 }
 ALL = SIMILARITIES | DISTANCES
-BLIND_TO_A_NEGATIVE = {"gmsd", "haarpsi", "cw_ssim", "detail"}
+BLIND_TO_A_NEGATIVE = {"gmsd", "haarpsi", "cw_ssim", "detail", "contrast"}
 
 
 def texture(seed, height=H, width=W):

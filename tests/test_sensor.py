@@ -42,6 +42,7 @@ def plain_sensor(on=0.2, off=0.17, refractory=0.0):
         noise=None,
         cutoff=None,
         phase=None,
+        start=None,
         key=jax.random.key(0),
     )
 
@@ -256,6 +257,18 @@ def test_wide_thresholds_and_mismatch(asymmetry):
     assert abs(np.std(own.on) - 0.03) < 0.001 and own.on.min() >= 0.01
 
 
+def test_in_the_middle_of_a_recording_references_are_anywhere_within_a_threshold():
+    settings = SensorSettings(threshold_range=(0.2, 0.2), asymmetry=0.2, mid_recording=True)
+    sensor = random_sensor(jax.random.key(4), height=80, width=90, settings=settings)
+    state = module.first_state(sensor, jnp.full((80, 90), 0.5))
+    above, on, off = np.asarray(state.above), float(sensor.on), float(sensor.off)
+    assert -off <= above.min() < 0.98 * -off and 0.98 * on < above.max() <= on
+    # so a rise of log intensity by part of a threshold fires that part of the thresholds' sum
+    brighter = jnp.exp(jnp.log(0.501) + 0.5 * on) - 0.001
+    _, (run,) = module.step(sensor, state, jnp.full((80, 90), brighter), jnp.int32(1000))
+    assert float(run.count.mean()) == pytest.approx(0.5 * on / (on + off), abs=0.02)
+
+
 def test_faults_are_switched_on_but_what_is_given_stays():
     chosen = with_faults(SensorSettings(mismatch=0.01, threshold=0.3))
     assert (chosen.mismatch, chosen.threshold) == (0.01, 0.3)
@@ -394,7 +407,8 @@ def textures():
 @pytest.fixture(scope="module")
 def setups(textures):
     """Sensors with every fault, a slow and a fast scene with an object each, bounds."""
-    return module.random_setups(jax.random.key(8), textures, **SETTINGS)
+    *both, durations = module.random_setups(jax.random.key(8), textures, **SETTINGS)
+    return *both, module.window_bounds(durations, SETTINGS["windows"])
 
 
 @pytest.fixture(scope="module")
@@ -531,8 +545,8 @@ def test_random_sequences_have_the_declared_shapes_and_do_not_retrace(textures):
 def test_rare_sequences_are_slow_and_calm_or_swift_before_a_blank_ground(textures):
     settings = SETTINGS | {"batch": 96, "sensor": replace(FAULTY, noise=(1.0, 1.0))}
     make = partial(module.random_setups, jax.random.key(3), textures, **settings)
-    sensors, scenes, bounds = make(slow=0.3, swift=0.2)
-    pixels = np.asarray(1e-6 * (bounds[1] - bounds[0]) * scenes.speed)
+    sensors, scenes, durations = make(slow=0.3, swift=0.2)
+    pixels = np.asarray(1e-6 * durations * scenes.speed)
     slow, swift = pixels < 0.31, pixels > 15.9
     assert 0.15 < slow.mean() < 0.45 and 0.08 < swift.mean() < 0.32
     assert pixels.min() > 0.019 and pixels.max() < 90.1

@@ -10,7 +10,7 @@ from firenet_jax.events import concatenate
 from firenet_jax.network import initial_state
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.scenes import video
-from firenet_jax.sensor import event_list, random_setups
+from firenet_jax.sensor import event_list, random_setups, window_bounds
 from firenet_jax.tensors import pack, voxelise
 from firenet_jax.textures import load_textures
 
@@ -23,9 +23,10 @@ def test_bounds_of_the_window_or_of_its_events_give_nearly_the_same_images(refer
     """Recordings are normalised by their first and last event, simulated windows by their ends."""
     weights = convert(reference / "firenet_published.pth")
     square = {"height": SIZE, "width": SIZE}
-    sensors, scenes, bounds = random_setups(
+    sensors, scenes, durations = random_setups(
         jax.random.key(3), jnp.asarray(load_textures(count=16)), batch=2, windows=T, **square
     )
+    bounds = window_bounds(durations, T)
     differences = []
     for b in range(2):
         sensor, scene = jax.tree.map(lambda leaf, b=b: leaf[b], (sensors, scenes))

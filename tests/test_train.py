@@ -3,6 +3,7 @@ import json
 import signal
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -20,6 +21,7 @@ from firenet_jax.files import locked
 from firenet_jax.losses import Loss
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.scenes import SceneSettings
+from firenet_jax.sensor import FAULTY, simulate, window_bounds
 from firenet_jax.textures import load_textures
 from firenet_jax.train import Log, Train, images_of, initial_train_state, run, train_step
 
@@ -143,6 +145,34 @@ def test_learns_one_batch_by_heart(tmp_path):
         seen.append(float(terms["loss"]))
     assert np.mean(seen[-5:]) < 0.6 * np.mean(seen[:5])
     assert train_step._cache_size() == 1
+
+
+def test_sequences_of_a_batch_are_of_different_ages_and_go_on_where_they_were(tmp_path):
+    settings = tiny(tmp_path, chain=4, sensor=replace(FAULTY, mid_recording=True))
+    textures, key = jnp.asarray(load_textures(None, 4, 64, 0, procedural=1.0)), jax.random.key(1)
+    lengths = train._lengths(settings)
+    assert lengths.tolist() == [2, 4]
+
+    make = jax.jit(partial(train._simulated, settings=settings))
+    state, seen, warm = initial_train_state(settings), [], []
+    for step in range(4):
+        data, carried, known = make(key, textures, state=state._replace(step=jnp.int32(step)))
+        state = state._replace(carried=carried)
+        seen.append(data.tensors)
+        warm.append(known.tolist())
+    assert warm == [[False, False], [True, True], [False, True], [True, True]]
+
+    def whole(number, windows):
+        numbers = jnp.full(2, number, jnp.int32)
+        *both, durations = train._setups(key, textures, settings, jnp.asarray(lengths), numbers)
+        bounds = window_bounds(durations, windows)
+        return simulate(*both, bounds, height=32, width=32, renderings=5)[1].tensors
+
+    seen, first = np.concatenate(seen), whole(0, 12)
+    np.testing.assert_allclose(seen[:, 1], first[:, 1], atol=1e-4)
+    np.testing.assert_allclose(seen[:6, 0], first[:6, 0], atol=1e-4)
+    np.testing.assert_allclose(seen[6:, 0], whole(1, 6)[:, 0], atol=1e-4)
+    assert not np.allclose(seen[6:, 0], first[6:, 0], atol=0.5)
 
 
 def test_remat_and_bfloat16_change_little(tmp_path):

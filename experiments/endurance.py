@@ -1,0 +1,416 @@
+"""How do weights behave over length, density, rest and contrast, beside those of others?
+
+    python experiments/endurance.py WEIGHTS... [--recordings FOLDER] [--only NAMES]      40 minutes
+
+WEIGHTS: "built-in", and files of others (the published checkpoint, FireNet+, ...); a name may be
+given, ours=PATH. The questions, each a function, an entry of results/endurance.json and a table:
+
+    long        16 simulated sequences of 1,000 windows, clean and faulty: SSIM, MSE and brightness
+                while young and old. A network that remembers well looks the same at every age.
+    rest        ten windows, then a thousand with nothing, or with noise: does what was seen stay,
+                and where does the image drift?
+    palindrome  a recording forward and backward, 40 times: all that was seen comes back, so the
+                image should be the same each time.
+    density     the same scenes cut into windows of .03 to 3 events per pixel.
+    contrast    what `firenet reconstruct RECORDING` shows: grey levels' standard deviation, and
+                how much the mean brightness moves from one picture to the next.
+    frames      recordings with camera frames: SSIM and MSE, with and without local equalisation.
+
+Simulated pictures are textures from `textures.HELD_OUT`, which no weights of ours were trained on.
+"""
+
+import argparse
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from harness import RESULTS, save
+from skimage.metrics import structural_similarity
+
+import firenet_jax as fj
+from firenet_jax import metrics
+from firenet_jax.equalise import equalise
+from firenet_jax.network import Weights, initial_state
+from firenet_jax.pictures import display, initial_display_state
+from firenet_jax.reconstruction import reconstruct
+from firenet_jax.scenes import SceneSettings, render
+from firenet_jax.sensor import (
+    FAULTY,
+    SensorSettings,
+    first_state,
+    random_setups,
+    simulate,
+    window_bounds,
+)
+from firenet_jax.sensor import step as sensor_step
+from firenet_jax.textures import HELD_OUT, load_textures, photographs
+
+SIZE = {"height": 120, "width": 160}
+SENSORS = {"clean": SensorSettings(), "faulty": replace(FAULTY, threshold_range=(0.1, 0.6))}
+BATCH = 4
+LENGTH, CHUNK = 1000, 50
+AGES = {"20-40": (20, 40), "100-150": (100, 150), "450-500": (450, 500), "950-1000": (950, 1000)}
+NOISES = (0.0, 0.02, 0.35)  # events per pixel in a window of rest
+RESTED = (5, 20, 50, 100, 400, 1000)
+ROUNDS = 40
+MOST = 40  # windows of a palindrome
+DENSITIES = (0.03, 0.1, 0.35, 1.0, 3.0)
+SPEEDS = {"slow": (5.0, 50.0), "fast": (200.0, 1000.0)}
+WARM, JUDGED = 30, 10  # windows of a sequence of one density
+PIXELS = 40.0  # by which a window of a density moves, at most: one for each rendering
+WITH_FRAMES = ("davis346_59_frames.aedat4", "ecd_slider_depth", "davis346_frames.aedat4")
+
+Methods = dict[str, Weights]
+
+
+def textures() -> jax.Array:
+    return jnp.asarray(load_textures(photographs(HELD_OUT), 40, 320, seed=0))
+
+
+def means(rows: list[dict]) -> dict[str, float]:
+    """Means and, as "key +-", standard errors."""
+    found = {}
+    for key in rows[0]:
+        values = np.array([row[key] for row in rows])
+        found[key] = float(values.mean())
+        found[f"{key} +-"] = float(values.std(ddof=1) / len(values) ** 0.5) if len(rows) > 1 else 0
+    return found
+
+
+def scores(images: np.ndarray, truths: np.ndarray, equalised: bool = False) -> list[dict]:
+    """(T, B, H, W) each -> of each of the B sequences the means over time."""
+    shown = np.clip(images, 0, 1)
+    values = {
+        "ssim": metrics.ssim(shown, truths),
+        "mse": metrics.mse(shown, truths),
+        "brightness": shown.mean((-2, -1)),
+        "truth": truths.mean((-2, -1)),
+        "contrast": shown.std((-2, -1)) / truths.std((-2, -1)),
+    }
+    if equalised:
+        pair = equalise(shown, "local"), equalise(truths, "local")
+        values["ssim_equalised"] = metrics.ssim(*pair)
+        values["mse_equalised"] = metrics.mse(*pair)
+    return [
+        {key: float(np.asarray(value)[:, b].mean()) for key, value in values.items()}
+        for b in range(images.shape[1])
+    ]
+
+
+def correlation(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.corrcoef(np.ravel(a), np.ravel(b))[0, 1])
+
+
+# ---- Simulated
+
+
+def long(methods: Methods, sequences: int = 16) -> list[dict]:
+    found = {}
+    pictures, scene = textures(), SceneSettings(speed=(20.0, 200.0))
+    for sensor in SENSORS:
+        for n in range(sequences // BATCH):
+            sensors, scenes, durations = random_setups(
+                jax.random.key(n), pictures, batch=BATCH, windows=LENGTH, scene=scene,
+                sensor=SENSORS[sensor], **SIZE,
+            )  # fmt: skip
+            seen = None
+            states = {name: initial_state(BATCH, *SIZE.values()) for name in methods}
+            images = {name: [] for name in methods}
+            truths = []
+            for first in range(0, LENGTH, CHUNK):
+                bounds = window_bounds(durations, CHUNK, first)
+                seen, data = simulate(sensors, scenes, bounds, seen, **SIZE)
+                for name, weights in methods.items():
+                    states[name], made = reconstruct(weights, states[name], data.tensors)
+                    images[name].append(np.asarray(made))
+                truths.append(np.asarray(data.images))
+            truths = np.concatenate(truths)
+            for name in methods:
+                made = np.concatenate(images[name])
+                for age, (start, stop) in AGES.items():
+                    rows = scores(made[start:stop], truths[start:stop])
+                    found.setdefault((sensor, age, name), []).extend(rows)
+    return [
+        {"sensor": sensor, "windows": age, "weights": name} | means(rows)
+        for (sensor, age, name), rows in found.items()
+    ]
+
+
+def rest(methods: Methods, batch: int = 2) -> list[dict]:
+    """Noise is balanced, ON and OFF as probable, uniform in time and place."""
+    pictures, rows = textures(), []
+    setup = random_setups(
+        jax.random.key(5), pictures, batch=batch, windows=10, scene=SceneSettings(pause=0.0), **SIZE
+    )
+    data = simulate(*setup[:2], window_bounds(setup[2], 10), **SIZE)[1]
+
+    shape = CHUNK, batch, *SIZE.values(), 5
+
+    @partial(jax.jit, static_argnames="noise")
+    def resting(key, noise: float):
+        bits = jax.random.bits(key, shape, jnp.uint16)
+        fired = bits >> 1 < round(2**15 * noise / 5)
+        return jnp.where(fired, jnp.where(bits & 1, 1.0, -1.0), 0.0)
+
+    for noise in NOISES:
+        states, found = {}, {}
+        for name, weights in methods.items():
+            states[name], images = reconstruct(
+                weights, initial_state(batch, *SIZE.values()), data.tensors
+            )
+            found[name] = {0: np.asarray(images[-1])}
+        for first in range(0, RESTED[-1], CHUNK):
+            tensors = resting(jax.random.key(first), noise)
+            for name, weights in methods.items():
+                states[name], images = reconstruct(weights, states[name], tensors)
+                for age in RESTED:
+                    if first < age <= first + CHUNK:
+                        found[name][age] = np.asarray(images[age - first - 1])
+        for name, images in found.items():
+            row = {"noise": noise, "weights": name}
+            row |= {f"brightness {age}": float(image.mean()) for age, image in images.items()}
+            for age in RESTED:
+                pairs = zip(images[age], images[0], strict=True)
+                row[f"correlation {age}"] = float(np.mean([correlation(*pair) for pair in pairs]))
+            rows.append(row)
+    return rows
+
+
+@partial(jax.jit, static_argnames=("height", "width", "renderings"))
+def _rates(sensors, scenes, durations, windows, *, height, width, renderings=64):
+    """Events per pixel in a window of each sequence, counted over the middle of it."""
+    start = durations * windows // 2
+    draw = jax.vmap(lambda scene, t: render(scene, 1e-6 * t, height=height, width=width).image)
+    step = jnp.maximum(durations // 8, 1)
+
+    def rendering(carry, k):
+        state, count = carry
+        state, runs = jax.vmap(sensor_step)(
+            sensors, state, draw(scenes, start + (k + 1) * step), step
+        )
+        return (state, count + sum(run.count.sum((-2, -1)) for run in runs)), None
+
+    state = jax.vmap(first_state)(sensors, draw(scenes, start))
+    (_, count), _ = jax.lax.scan(
+        rendering, (state, jnp.zeros(len(durations), jnp.int32)), jnp.arange(renderings)
+    )
+    return count / (height * width) / (renderings / 8)
+
+
+def density(methods: Methods, batches: int = 2) -> list[dict]:
+    pictures, rows = textures(), []
+    windows = WARM + JUDGED
+    for sensor in SENSORS:
+        for speed in SPEEDS:
+            scene = SceneSettings(speed=SPEEDS[speed], pause=0.0)
+            for wanted in DENSITIES:
+                found = {name: [] for name in methods}
+                for n in range(batches):
+                    make = partial(
+                        random_setups, jax.random.key(n), pictures, batch=BATCH, scene=scene,
+                        sensor=SENSORS[sensor], **SIZE,
+                    )  # fmt: skip
+                    sensors, scenes, durations = make(windows=400)
+                    rate = _rates(sensors, scenes, durations, 400, **SIZE)
+                    longest = 1e6 * PIXELS / scenes.speed
+                    durations = jnp.clip(durations * wanted / jnp.maximum(rate, 1e-6), 200, longest)
+                    durations = durations.astype(jnp.int32)
+                    bounds = window_bounds(durations, windows)
+                    data = simulate(sensors, scenes, bounds, renderings=round(PIXELS), **SIZE)[1]
+                    truths = np.asarray(data.images[WARM:])
+                    for name, weights in methods.items():
+                        state = initial_state(BATCH, *SIZE.values())
+                        images = np.asarray(reconstruct(weights, state, data.tensors)[1])
+                        found[name] += scores(images[WARM:], truths, equalised=True)
+                for name in methods:
+                    labels = {"sensor": sensor, "speed": speed, "density": wanted, "weights": name}
+                    rows.append(labels | means(found[name]))
+    return rows
+
+
+# ---- Recordings
+
+
+def palindrome(methods: Methods, recordings: list[Path]) -> list[dict]:
+    """Time reversed, polarity inverted: bins the other way round, votes negated."""
+    rows = []
+    for path in recordings:
+        recording = fj.open_recording(path)
+        windows = []
+        for tensors, _ in fj.event_tensors(recording, chunk=1):
+            windows.append(tensors[0])
+            if len(windows) == MOST:
+                break
+        if len(windows) <= 3:
+            continue
+        forth = jnp.stack(windows)
+        back = -forth[::-1, ..., ::-1]
+        for name, weights in methods.items():
+            state = initial_state(1, recording.height, recording.width)
+            ends = []
+            for _ in range(ROUNDS):
+                state, images = reconstruct(weights, state, forth)
+                ends.append(np.asarray(images[-1, 0]))
+                state, _ = reconstruct(weights, state, back)
+            rows.append(
+                {
+                    "recording": path.name,
+                    "weights": name,
+                    "correlation": correlation(ends[-1], ends[1]),
+                    "brightness 2": float(ends[1].mean()),
+                    "brightness 40": float(ends[-1].mean()),
+                }
+            )
+    return rows
+
+
+def contrast(methods: Methods, recordings: list[Path]) -> list[dict]:
+    """Over all pictures but the first five, as the printed command shows them."""
+    rows = []
+    for path in recordings:
+        recording = fj.open_recording(path)
+        states = {
+            name: (initial_state(1, recording.height, recording.width), initial_display_state(1))
+            for name in methods
+        }
+        pictures = {name: [] for name in methods}
+        for tensors, _ in fj.event_tensors(recording):
+            for name, weights in methods.items():
+                state, shown = states[name]
+                state, images = reconstruct(weights, state, tensors)
+                shown, greys = display(shown, images)
+                states[name] = state, shown
+                pictures[name].append(np.asarray(greys[:, 0]))
+        for name in methods:
+            greys = np.concatenate(pictures[name]).astype(np.float32)
+            greys = greys[min(5, len(greys) - 1) :]
+            brightness = greys.mean((-2, -1))
+            moved = np.abs(np.diff(brightness))
+            rows.append(
+                {
+                    "recording": path.name,
+                    "weights": name,
+                    "deviation": float(greys.std((-2, -1)).mean()),
+                    "brightness": float(brightness.mean()),
+                    "moves": float(moved.mean()) if len(moved) else 0.0,
+                    "99 %": float(np.percentile(greys, 99)),
+                    "1 %": float(np.percentile(greys, 1)),
+                }
+            )
+    return rows
+
+
+def similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """SSIM of each pixel."""
+    return structural_similarity(
+        a,
+        b,
+        data_range=1.0,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+    )[1]
+
+
+def frames(methods: Methods, recordings: list[Path]) -> list[dict]:
+    """Windows between frames; what follows a frame by a window counts from the second on. Of a
+    camera at rest only where events are (within 3 pixels of one in the last five windows)."""
+    rows = []
+    for path in recordings:
+        if path.name not in WITH_FRAMES:
+            continue
+        recording = fj.open_recording(path)
+        stamps = recording.frames.times
+        truths = [np.float32(recording.frames.read(k)) / 255 for k in range(len(stamps))]
+        states = {n: initial_state(1, recording.height, recording.width) for n in methods}
+        found = {name: [] for name in methods}
+        seen = []
+        for tensors, times in fj.event_tensors(recording, chunk=1, between_frames=True):
+            seen = [*seen[-4:], np.asarray(jnp.abs(tensors[0, 0]).sum(-1) > 0)]
+            near = np.asarray(
+                jax.lax.reduce_window(
+                    np.any(seen, 0).astype(np.float32), 0.0, jax.lax.max, (7, 7), (1, 1), "SAME"
+                )
+            )
+            place = int(np.argmin(np.abs(stamps - times[0])))
+            close = abs(int(stamps[place]) - int(times[0])) <= 5000 and place > 0
+            for name, weights in methods.items():
+                states[name], images = reconstruct(weights, states[name], tensors)
+                if not close or not near.any():
+                    continue
+                image, truth = np.clip(np.asarray(images[0, 0]), 0, 1), truths[place]
+                row = {}
+                for kind in ("none", "local"):
+                    a, b = equalise(image[None], kind)[0], equalise(truth[None], kind)[0]
+                    label = "" if kind == "none" else "_equalised"
+                    row[f"mse{label}"] = float((near * (a - b) ** 2).sum() / near.sum())
+                    row[f"ssim{label}"] = float((near * similarity(a, b)).sum() / near.sum())
+                found[name].append(row)
+        for name in methods:
+            rows.append({"recording": path.name, "weights": name} | means(found[name]))
+    return rows
+
+
+# ---- All of it
+
+SIMULATED = {"long": long, "rest": rest, "density": density}
+QUICK = {"long": 4, "rest": 1, "density": 1}
+RECORDED = {"palindrome": palindrome, "contrast": contrast, "frames": frames}
+
+
+def _readable(path: Path) -> bool:
+    try:
+        fj.open_recording(path)
+    except fj.RecordingError as error:
+        print(f"not read: {error}")
+        return False
+    return True
+
+
+def table(rows: list[dict]) -> None:
+    columns = [key for key in rows[0] if not key.endswith(" +-")]
+    print(*(f"{key[:14]:>14}" for key in columns))
+    for row in rows:
+        cells = (
+            f"{row[k]:14.4f}" if isinstance(row[k], float) else f"{row[k]:>14}" for k in columns
+        )
+        print(*(cell[:22] for cell in cells))
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("weights", nargs="+", help="built-in, FILE or NAME=FILE")
+    parser.add_argument("--recordings", type=Path, help="a folder of them")
+    parser.add_argument("--only", nargs="*", default=[*SIMULATED, *RECORDED])
+    parser.add_argument("--quick", action="store_true", help="fewer sequences; writes nothing")
+    options = parser.parse_args()
+    methods = {}
+    for each in options.weights:
+        name, _, path = each.rpartition("=")
+        methods[name or Path(path).stem] = fj.load_weights(None if path == "built-in" else path)
+    recordings = sorted(options.recordings.iterdir()) if options.recordings else []
+    recordings = [path for path in recordings if _readable(path)]
+    last = RESULTS / "endurance.json"
+    results = json.loads(last.read_text()) if last.exists() else {}
+    results.pop("machine", None)
+    for name, function in (SIMULATED | RECORDED).items():
+        if name not in options.only or (name in RECORDED and not recordings):
+            continue
+        if name in SIMULATED:
+            rows = function(methods, QUICK[name]) if options.quick else function(methods)
+        else:
+            rows = function(methods, recordings)
+        print(f"\n{name}")
+        table(rows)
+        results[name] = rows
+        if not options.quick:
+            save("endurance", results)
+
+
+if __name__ == "__main__":
+    main()
