@@ -9,9 +9,10 @@ published weights', over pairs of sequences. Losses, stages and the mean of weig
 these pictures: they validate, an untouched test they are not. Local equalisation is that of
 `equalise`.
 Recordings: three windows of each after warming up, the same windows for both networks, as
-`firenet reconstruct RECORDING -N EVENTS` shows them; event pictures, theirs, ours. And over their last twelve windows, how well an image tells where the next
-window's events fall (`metrics.event_correlation`), with the same events turned by 180 degrees for
-what chance gives. Writes results/shipped_weights.json, docs/shipped_simulated.jpg and
+`firenet reconstruct RECORDING -N EVENTS` shows them; event pictures, theirs, ours. And over their
+last twelve windows, how well an image tells where the next window's events fall
+(`metrics.event_correlation`), with the same events turned by 180 degrees for what chance gives.
+Writes results/shipped_weights.json, docs/shipped_simulated.jpg and
 docs/shipped_recordings.jpg.
 """
 

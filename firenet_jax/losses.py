@@ -24,7 +24,8 @@ class Loss:
     """The weights of Eq. 2; a term of weight 0 is not computed.
 
     The default did best in experiments/compare_losses.py.
-    gmsd, haarpsi, cw_ssim and contrast cannot tell an image from its negative: never use them alone.
+    gmsd, haarpsi, cw_ssim and contrast cannot tell an image from its negative: never use them
+    alone.
     """
 
     l1: float = 1.0
