@@ -1,16 +1,18 @@
 """Image, kernel -> image: the convolution of all layers, quick on a CPU too, and its gradient.
 
 Images are (B, H, W, channels), kernels (rows, columns, inputs, outputs), odd sizes, zero padding,
-no striding. Forward and the gradient with respect to the image are XLA's convolutions, on a CPU
-with few channels in another form. The gradient with respect to the kernel is XLA's on accelerators;
-on a CPU, inside a scan, XLA computes it in a way that takes many times as long as the matrix
-products below.
+no striding. On accelerators all is XLA's. On a CPU, 3x3 convolutions and their gradients are
+machine code of our own (`native`), where there is some. Where there is none, they are XLA's too,
+with few channels in another form, but for the gradient with respect to the kernel: inside a scan,
+XLA computes it in a way that takes many times as long as the matrix products below.
 """
 
 from functools import partial
 
 import jax
 import jax.numpy as jnp
+
+from firenet_jax import native
 
 DIMENSIONS = ("NHWC", "HWIO", "NHWC")
 
@@ -50,26 +52,38 @@ def side_by_side(image: jax.Array, kernel: jax.Array, pixels: int) -> jax.Array:
     return image.reshape(batch, height, pixels * groups, outputs)[:, :, :width]
 
 
-@jax.custom_vjp
 def convolve(image: jax.Array, kernel: jax.Array) -> jax.Array:
     """(B, H, W, I), (rows, columns, I, O) -> (B, H, W, O); gradients in reverse mode only."""
-    return _convolve(image, kernel)
+    return _convolve_by(native.is_wanted(), image, kernel)
 
 
-def _forward(image, kernel):
-    return _convolve(image, kernel), (image, kernel)
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _convolve_by(machine_code: bool, image, kernel):
+    ours = native.choose if machine_code else _only_xla
+    return ours(lambda *these: native.convolve(*these), _convolve, image, kernel)
 
 
-def _backward(kept, gradient):
+def _only_xla(_, xla, *arguments):
+    return xla(*arguments)
+
+
+def _forward(machine_code, image, kernel):
+    return _convolve_by(machine_code, image, kernel), (image, kernel)
+
+
+def _backward(machine_code, kept, gradient):
     image, kernel = kept
     flipped = kernel[::-1, ::-1].swapaxes(2, 3)
-    by_kernel = jax.lax.platform_dependent(
-        image, kernel, gradient, cpu=kernel_gradient, default=_xla_kernel_gradient
+    ours = native.choose if machine_code else _only_xla
+    by_kernel = ours(
+        lambda *these: native.kernel_gradient(*these),
+        partial(jax.lax.platform_dependent, cpu=kernel_gradient, default=_xla_kernel_gradient),
+        *(image, kernel, gradient),
     )
-    return _convolve(gradient, flipped), by_kernel
+    return _convolve_by(machine_code, gradient, flipped), by_kernel
 
 
-convolve.defvjp(_forward, _backward)
+_convolve_by.defvjp(_forward, _backward)
 
 
 def _xla_kernel_gradient(image, kernel, gradient):

@@ -6,7 +6,7 @@ may be streamed in chunks of any T, and B recordings of different lengths may ru
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -15,7 +15,15 @@ from jax.sharding import Mesh
 
 from firenet_jax import colour, native
 from firenet_jax.devices import BATCH, EVERYWHERE, TIME_BATCH, on_each_device
-from firenet_jax.network import BINS, State, Weights, initial_state, step
+from firenet_jax.network import (
+    BINS,
+    CHANNELS,
+    State,
+    Weights,
+    initial_params,
+    initial_state,
+    step,
+)
 from firenet_jax.pictures import (
     Display,
     DisplayState,
@@ -41,7 +49,7 @@ class Network:
     each is reconstructed by itself, three quarters more work."""
 
 
-@partial(jax.jit, static_argnames=("recurrent", "dtype"))
+@partial(jax.jit, static_argnames=("recurrent", "dtype", "machine_code"))
 def reconstruct(
     weights: Weights,
     state: State,
@@ -50,28 +58,43 @@ def reconstruct(
     *,
     recurrent: bool = True,
     dtype=jnp.float32,
+    machine_code: bool = True,
 ) -> tuple[State, jax.Array]:
     """(State, (T, B, H, W, 5)) -> (State, images (T, B, H, W) float32).
 
     tensors: as `event_tensors` gives them; normalised here if the weights ask for it.
-    valid: (T, B) bool; where False the state stays as it was and the image means nothing (tensors
-    must be finite there too).
+    valid: (T, B) or (T, 1) bool; where False the state stays as it was and the image means nothing
+    (tensors must be finite there too).
     recurrent: False starts every window from a zero state (the state returned is zero).
-    On a CPU, in float32, the scan's body is `native.step`, where there is one; gradients, in
-    reverse mode only, are those of `network.step`.
-    Raises ValueError where the shapes of state and tensors do not belong together.
+    machine_code: False leaves all to XLA. Else, on a CPU and in float32, the step is `native.step`,
+    where there is one; not with FIRENET_NATIVE=0 in the environment, nor in what is exported.
+    Gradients, in reverse mode only, are those of `network.step`.
+    Tensors, state and parameters of types that float32 holds exactly become float32.
+    Raises ValueError for other types, and where shapes do not belong together.
     """
-    _check_shapes(state, tensors)
+    weights, state, tensors, valid = _checked(weights, state, tensors, valid)
     if not recurrent:
         state = jax.tree.map(jnp.zeros_like, state)
-    if dtype == jnp.float32 and native.supports(*tensors.shape[2:4], weights.normalise):
-        return _native(recurrent, weights, state, tensors, valid)
-    return _scan(
-        partial(step, weights.params, dtype=dtype), recurrent, weights, state, tensors, valid
-    )
+    if dtype == jnp.float32 and machine_code:
+        return _quickest(recurrent, weights, state, tensors, valid)
+    with native.by_xla_alone(not machine_code):
+        return _by_xla(recurrent, dtype, weights, state, tensors, valid)
 
 
-def _scan(step, recurrent: bool, weights: Weights, state: State, tensors, valid):
+def _by_xla(recurrent: bool, dtype, weights: Weights, state: State, tensors, valid):
+    network_step = partial(step, weights.params, dtype=dtype)
+    return _scan(network_step, recurrent, weights, state, tensors, valid)
+
+
+def _by_machine_code(recurrent: bool, weights: Weights, state: State, tensors, valid):
+    packed, normalised = native.pack(weights.params), replace(weights, normalise=False)
+    native_step = partial(native.step, packed, normalise=weights.normalise)
+    enclosed = native.enclose(state)
+    enclosed, images = _scan(native_step, recurrent, normalised, enclosed, tensors, valid)
+    return State(*native.interior(enclosed, *tensors.shape[2:4])), images
+
+
+def _scan(step, recurrent: bool, weights: Weights, state, tensors, valid):
     def body(state, inputs):
         tensor, exists = inputs
         # Here, not for all windows at once: sums would be rounded otherwise for each T.
@@ -83,37 +106,90 @@ def _scan(step, recurrent: bool, weights: Weights, state: State, tensors, valid)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _native(recurrent, weights, state, tensors, valid):
-    """The same by the step that has no gradient; for one, everything is computed again by XLA."""
-    packed, normalised = native.pack(weights.params), replace(weights, normalise=False)
-    native_step = partial(native.step, packed, normalise=weights.normalise)
-    state = native.enclose(state)
-    state, images = _scan(native_step, recurrent, normalised, state, tensors, valid)
-    return native.interior(state, *tensors.shape[2:4]), images
+def _quickest(recurrent, *inputs):
+    xla = partial(_by_xla, recurrent, jnp.float32)
+    return native.choose(partial(_by_machine_code, recurrent), xla, *inputs)
 
 
-def _native_forward(recurrent, *inputs):
-    return _native(recurrent, *inputs), inputs
+def _forward(recurrent, *inputs):
+    """Machine code keeps nothing of what a gradient needs."""
+    return jax.vjp(partial(_by_xla, recurrent, jnp.float32), *inputs)
 
 
-def _native_backward(recurrent, inputs, cotangents):
-    def plain(weights, *rest):
-        return _scan(partial(step, weights.params), recurrent, weights, *rest)
-
-    return jax.vjp(plain, *inputs)[1](cotangents)
+def _backward(recurrent, gradient_of, cotangents):
+    return gradient_of(cotangents)
 
 
-_native.defvjp(_native_forward, _native_backward)
+_quickest.defvjp(_forward, _backward)
 
 
-def _check_shapes(state: State, tensors: jax.Array) -> None:
-    if tensors.ndim != 5 or tensors.shape[-1] != BINS:
-        raise ValueError(f"event tensors are (T, B, H, W, {BINS}), not {tensors.shape}")
-    if state.g1.shape[:3] != tensors.shape[1:4]:
-        raise ValueError(
-            f"the state is for (B, H, W) = {state.g1.shape[:3]}, the event tensors are "
-            f"{tensors.shape[1:4]}: make it with initial_state(batch, height, width)"
-        )
+# --- The door: the same for both ways
+
+
+def _checked(weights: Weights, state: State, tensors, valid):
+    """All of `reconstruct`'s arrays in float32; raises ValueError where they do not fit."""
+    if jnp.ndim(tensors) != 5 or jnp.shape(tensors)[-1] != BINS:
+        raise ValueError(f"event tensors are (T, B, H, W, {BINS}), not {jnp.shape(tensors)}")
+    shape = jnp.shape(tensors)[:4]
+    for name, h in state._asdict().items():
+        if jnp.shape(h) != (*shape[1:], CHANNELS):
+            raise ValueError(
+                f"the state's {name} is {jnp.shape(h)}, but event tensors {(*shape, BINS)} need "
+                f"{(*shape[1:], CHANNELS)}: make it with initial_state(batch, height, width)"
+            )
+    if valid is not None:
+        if jnp.shape(valid) not in (shape[:2], (shape[0], 1)):
+            raise ValueError(
+                f"valid is {jnp.shape(valid)}, but for event tensors {(*shape, BINS)} (T, B) is "
+                f"{shape[:2]}"
+            )
+        if jnp.result_type(valid) != jnp.bool_:
+            raise ValueError(f"valid is {jnp.result_type(valid)}, but must be bool")
+        valid = jnp.broadcast_to(valid, shape[:2])
+    _check_params(weights.params)
+    params = _as_float32(weights.params, "parameters")
+    state, tensors = _as_float32(state, "state"), _as_float32(tensors, "event tensors")
+    return replace(weights, params=params), state, tensors, valid
+
+
+def _as_float32(tree, name: str):
+    """Raises ValueError for types with numbers that float32 rounds."""
+
+    def one(x):
+        kind = jnp.result_type(x)
+        if jnp.issubdtype(kind, jnp.floating):
+            exact = jnp.finfo(kind).bits <= 32
+        else:  # all whole numbers of 24 bits are float32
+            whole = jnp.issubdtype(kind, jnp.integer)
+            exact = kind == jnp.bool_ or (whole and jnp.iinfo(kind).max <= 2**24)
+        if not exact:
+            raise ValueError(
+                f"{name} are of type {kind}, which float32 does not hold exactly: pass them as "
+                "float32"
+            )
+        return jnp.asarray(x, jnp.float32)
+
+    return jax.tree.map(one, tree)
+
+
+def _check_params(params) -> None:
+    expected = _shapes_of_params()
+    found = {jax.tree_util.keystr(path): jnp.shape(leaf) for path, leaf in _leaves(params)}
+    for name in sorted(expected.keys() | found.keys()):
+        if found.get(name) != expected.get(name):
+            raise ValueError(
+                f"the weights' parameter {name} is {found.get(name, 'missing')}, but FireNet's is "
+                f"{expected.get(name, 'not there')}"
+            )
+
+
+_leaves = jax.tree_util.tree_leaves_with_path
+
+
+@cache
+def _shapes_of_params() -> dict[str, tuple[int, ...]]:
+    shapes = jax.eval_shape(initial_params, jax.random.key(0))
+    return {jax.tree_util.keystr(path): leaf.shape for path, leaf in _leaves(shapes)}
 
 
 class Session(NamedTuple):

@@ -1,10 +1,16 @@
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from firenet_jax.foreign_call import register
-from firenet_jax.machine_code import INT, POINTER, Function, Module, integer, vectors
+from firenet_jax.native import foreign_call
+from firenet_jax.native.foreign_call import register
+from firenet_jax.native.llvm import INT, POINTER, Function, Module, integer, vectors
 
 pytestmark = pytest.mark.skipif(
     vectors() == 0 or jax.default_backend() != "cpu", reason="no machine code for this processor"
@@ -47,3 +53,69 @@ def test_every_part_runs_once_and_stages_wait_for_each_other():
         expected = numbers + 1 + np.roll(numbers + 1, 1, axis=1)
         for _ in range(runs):
             np.testing.assert_array_equal(call(numbers)[1], expected)
+
+
+# Each number of the source and what the header says it is.
+OF_THE_HEADER = {
+    "FRAME_EXTENSION": "offsetof(XLA_FFI_CallFrame, extension_start)",
+    "FRAME_API": "offsetof(XLA_FFI_CallFrame, api)",
+    "FRAME_CONTEXT": "offsetof(XLA_FFI_CallFrame, ctx)",
+    "FRAME_ARGUMENTS": "offsetof(XLA_FFI_CallFrame, args) + offsetof(XLA_FFI_Args, args)",
+    "FRAME_RESULTS": "offsetof(XLA_FFI_CallFrame, rets) + offsetof(XLA_FFI_Rets, rets)",
+    "EXTENSION_TYPE": "offsetof(XLA_FFI_Extension_Base, type)",
+    "EXTENSION_METADATA": "offsetof(XLA_FFI_Metadata_Extension, metadata)",
+    "IS_METADATA": "XLA_FFI_Extension_Metadata",
+    "METADATA_MAJOR": "offsetof(XLA_FFI_Metadata, api_version)"
+    " + offsetof(XLA_FFI_Api_Version, major_version)",
+    "METADATA_MINOR": "offsetof(XLA_FFI_Metadata, api_version)"
+    " + offsetof(XLA_FFI_Api_Version, minor_version)",
+    "BUFFER_DATA": "offsetof(XLA_FFI_Buffer, data)",
+    "BUFFER_DIMENSIONS": "offsetof(XLA_FFI_Buffer, dims)",
+    "API_DESTROY_ERROR": "offsetof(XLA_FFI_Api, XLA_FFI_Error_Destroy)",
+    "API_SCHEDULE": "offsetof(XLA_FFI_Api, XLA_FFI_ThreadPool_Schedule)",
+    "API_THREADS": "offsetof(XLA_FFI_Api, XLA_FFI_ThreadPool_NumThreads)",
+}
+# Structures that `handler` makes itself: 16 bytes of head, then these, 8 bytes each.
+MADE = {
+    "XLA_FFI_Error_Destroy_Args": ["error"],
+    "XLA_FFI_ThreadPool_Schedule_Args": ["ctx", "task", "data"],
+    "XLA_FFI_ThreadPool_NumThreads_Args": ["ctx", "num_threads"],
+}
+
+
+@pytest.fixture(scope="module")
+def header():
+    return Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h"
+
+
+def test_places_in_structures_are_those_of_the_header(header, tmp_path):
+    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
+        pytest.skip("no C compiler")
+    numbers = dict(OF_THE_HEADER)
+    for name, fields in MADE.items():
+        numbers |= {f"{name}.{field}": f"offsetof({name}, {field})" for field in fields}
+        numbers |= {name: f"sizeof({name})"}
+    lines = [f'printf("{name} %zu\\n", (size_t)({code}));' for name, code in numbers.items()]
+    code = f'#include <stddef.h>\n#include <stdio.h>\n#include "{header}"\n'
+    (tmp_path / "places.c").write_text(code + "int main() {" + "\n".join(lines) + "}\n")
+    program = tmp_path / "places"
+    subprocess.run([compiler, "-o", program, tmp_path / "places.c"], check=True)
+    output = subprocess.run([program], check=True, capture_output=True, text=True).stdout
+    found = {name: int(number) for name, number in map(str.split, output.splitlines())}
+    for name in OF_THE_HEADER:
+        assert found[name] == getattr(foreign_call, name), name
+    for name, fields in MADE.items():
+        assert found[name] == 16 + 8 * len(fields)
+        assert [found[f"{name}.{field}"] for field in fields] == [
+            16 + 8 * i for i in range(len(fields))
+        ]
+
+
+def test_the_interface_is_that_of_the_header_or_older(header):
+    """XLA calls handlers of older versions; a newer one than its own it refuses."""
+    text = header.read_text()
+    major, minor = (
+        int(re.search(rf"#define XLA_FFI_API_{part} (\d+)", text)[1]) for part in ("MAJOR", "MINOR")
+    )
+    assert foreign_call.API_VERSION[0] == major and foreign_call.API_VERSION[1] <= minor

@@ -3,7 +3,7 @@ import ctypes
 import numpy as np
 import pytest
 
-from firenet_jax.machine_code import (
+from firenet_jax.native.llvm import (
     FLOAT,
     INT,
     LANES,
@@ -11,7 +11,7 @@ from firenet_jax.machine_code import (
     VECTOR,
     Function,
     Module,
-    address,
+    compiled,
     integer,
     vectors,
 )
@@ -19,14 +19,14 @@ from firenet_jax.machine_code import (
 pytestmark = pytest.mark.skipif(vectors() == 0, reason="no machine code for this processor")
 
 
-def compiled(name, write, *kinds, result=None):
+def function_of(name, write, *kinds, result=None):
     """A function of Python: write(Function) -> its result, or None."""
     module = Module()
     f = Function(module, name, list(kinds), result, public=True)
     value = write(f)
     _ = f.b.ret_void() if value is None else f.b.ret(value)
     types = {POINTER: ctypes.c_void_p, INT: ctypes.c_int64, FLOAT: ctypes.c_float, None: None}
-    return ctypes.CFUNCTYPE(types[result], *map(types.get, kinds))(address(module, name))
+    return ctypes.CFUNCTYPE(types[result], *map(types.get, kinds))(compiled(module)(name))
 
 
 def of_lanes(name, write):
@@ -36,7 +36,7 @@ def of_lanes(name, write):
         value = write(f, f.load(VECTOR, f.arguments[0]))
         f.store(value, f.arguments[1])
 
-    function = compiled(name, body, POINTER, POINTER)
+    function = function_of(name, body, POINTER, POINTER)
 
     def call(x):
         # Vectors lie at multiples of 64 bytes.
@@ -72,10 +72,10 @@ def test_functions_of_numbers_at_the_ends():
     np.testing.assert_array_equal(relu[:5], [0, 0, np.float32(1e30), np.inf, np.nan])
 
 
-def test_total_and_everywhere():
+def test_reduce_and_splat():
     x = np.arange(16, dtype=np.float32) ** 2
     total = of_lanes(
-        "total", lambda f, x: f.everywhere(f.total(x, f.b.extract_element(x, integer(2))))
+        "total", lambda f, x: f.splat(f.reduce_add(x, f.b.extract_element(x, integer(2))))
     )
     np.testing.assert_array_equal(total(x), [x.sum() + 4] * 16)
 
@@ -89,5 +89,5 @@ def test_loops_carry_values():
 
         return f.loop(2, f.arguments[0], outer, [integer(0)])[0]
 
-    function = compiled("loops", write, INT, result=INT)
+    function = function_of("loops", write, INT, result=INT)
     assert function(9) == sum(i * j for i in range(2, 9) for j in range(i))

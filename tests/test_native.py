@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from test_network import random_run
 
-from firenet_jax import foreign_call, machine_code, native, network
+from firenet_jax import native, network
+from firenet_jax.native import llvm, whole_step
 from firenet_jax.network import State, Weights, initial_state
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.tensors import normalise
 
 pytestmark = pytest.mark.skipif(
-    not native.supports(8, 8), reason="no machine code for this processor"
+    jax.default_backend() != "cpu" or llvm.vectors() == 0,
+    reason="no machine code for this processor",
 )
 
 
@@ -33,7 +35,8 @@ def both(params, state, tensors, exists):
     height, width = tensors.shape[2:4]
 
     def plain(state, tensor, exists):
-        return network.step(params, state, tensor, exists)
+        with native.by_xla_alone():
+            return network.step(params, state, tensor, exists)
 
     packed = native.pack(params)
 
@@ -42,7 +45,7 @@ def both(params, state, tensors, exists):
 
     expected = scanned(plain, state, tensors, exists)
     after, images = scanned(ours, native.enclose(state), tensors, exists)
-    return expected, (native.interior(after, height, width), images)
+    return expected, (State(*native.interior(after, height, width)), images)
 
 
 @pytest.mark.parametrize(
@@ -75,7 +78,7 @@ def test_normalises_as_tensors_do(height, width):
 
 @pytest.mark.parametrize("halves", [(1,), (1, 2), (5 / 8, 3 / 2)])
 def test_winograd_is_a_correlation(halves):
-    direction = native._winograd(*halves)
+    direction = whole_step._winograd(*halves)
     rng = np.random.default_rng(0)
     pixels, kernel = rng.normal(size=direction.patch), rng.normal(size=3)
     products = (direction.kernel @ kernel) * (direction.input @ pixels)
@@ -85,9 +88,9 @@ def test_winograd_is_a_correlation(halves):
 
 def test_processors_with_vectors_of_256_bits(monkeypatch):
     """The instructions of one run on all that have more."""
-    features = machine_code.binding.FeatureMap({"avx2": True, "fma": True})
-    monkeypatch.setattr(machine_code.binding, "get_host_cpu_name", lambda: "haswell")
-    monkeypatch.setattr(machine_code.binding, "get_host_cpu_features", lambda: features)
+    features = llvm.binding.FeatureMap({"avx2": True, "fma": True})
+    monkeypatch.setattr(llvm.binding, "get_host_cpu_name", lambda: "haswell")
+    monkeypatch.setattr(llvm.binding, "get_host_cpu_features", lambda: features)
     params, tensors = random_run(steps=2, batch=2, height=15, width=43)
     exists = jnp.ones((2, 2), bool)
     expected, found = both(params, random_state(2, 15, 43), tensors, exists)
@@ -131,28 +134,11 @@ def test_many_at_once_give_the_same_bits():
 def test_runs_where_xla_has_one_thread():
     script = (
         "import jax.numpy as jnp, firenet_jax as fj\n"
-        "from firenet_jax import native\n"
-        "assert native.supports(30, 40)\n"
         "images = fj.reconstruct(fj.load_weights(), fj.initial_state(1, 30, 40), "
         "jnp.ones((50, 1, 30, 40, 5)))[1]\n"
         "assert bool(jnp.isfinite(images).all())\n"
+        "from firenet_jax.native import choice\n"
+        "assert choice._made and not choice._failure\n"
     )
     flags = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}
     subprocess.run([sys.executable, "-c", script], env=os.environ | flags, check=True)
-
-
-def test_without_machine_code_xla_reconstructs(monkeypatch):
-    params, tensors = random_run(steps=3, batch=1, height=10, width=17)
-    expected = reconstruct(Weights(params, False), initial_state(1, 10, 17), tensors)
-    jax.clear_caches()
-    monkeypatch.setattr(native, "vectors", lambda: 0)
-    monkeypatch.setattr(native, "step", None)
-    found = reconstruct(Weights(params, False), initial_state(1, 10, 17), tensors)
-    jax.clear_caches()
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), found, expected)
-
-
-def test_another_version_of_the_interface_is_no_end(monkeypatch):
-    monkeypatch.setattr(foreign_call, "API_VERSION", (99, 0))
-    with pytest.warns(UserWarning, match="slower than it could be"):
-        assert not native.supports(6, 77)

@@ -14,6 +14,7 @@ PACKAGE = Path(fj.__file__).parent
 
 # Left never imports right. Modules on one line do not import each other.
 LAYERS = [
+    ["native"],
     [
         "events",
         "colour",
@@ -25,7 +26,6 @@ LAYERS = [
         "warp",
         "equalise",
         "devices",
-        "machine_code",
     ],
     [
         "video",
@@ -36,9 +36,8 @@ LAYERS = [
         "scenes",
         "textures",
         "lpips",
-        "foreign_call",
     ],
-    ["filters", "tensors", "checkpoint", "losses", "native"],
+    ["filters", "tensors", "checkpoint", "losses"],
     ["reconstruction", "sensor"],
     ["baselines"],
     ["info", "pipeline", "dataset", "batches", "methods", "report"],
@@ -53,7 +52,7 @@ DOORS = {
     "av": {"video", "dataset"}, "h5py": {"readers", "dataset", "batches", "evaluate"},
     "pyarrow": {"readers"},
     "grain": {"batches"}, "faery": {"readers"}, "rosbags": {"readers"}, "hdf5plugin": {"readers"},
-    "skimage": {"equalise"}, "llvmlite": {"machine_code"},
+    "skimage": {"equalise"}, "llvmlite": {"native"},
 }  # fmt: skip
 
 

@@ -1,10 +1,9 @@
-"""(packed parameters, State, event tensor) -> (State, image): the step of a CPU, as machine code.
+"""(packed parameters, states, event tensor) -> (states, image): the step of a CPU, as machine code.
 
 The function of `network.step`, float32, equal to rounding, without a gradient. On a CPU, XLA's time
 goes into 3x3 convolutions of 16 channels that run near the processor's rate already: less time
 takes fewer products, for which XLA has no operation. Here the whole step is one function that XLA's
-programs call, compiled for the processor at hand when an image size is first seen; `supports` says
-where there is one.
+programs call, compiled for the processor at hand when an image size is first seen.
 
 Convolutions are Winograd's F(4x2, 3x3) (Lavin and Gray, "Fast Algorithms for Convolutional Neural
 Networks", CVPR 2016, Eqs. 5 to 8): 24 products instead of 72 for 4 rows of 2 pixels,
@@ -16,18 +15,16 @@ with * element by element, d a patch of 6x4 pixels of an input and g its kernel.
 pixel of the image.
 """
 
-import warnings
 from collections.abc import Callable
-from functools import cache
-from threading import Lock
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from firenet_jax.foreign_call import register
-from firenet_jax.machine_code import (
+from firenet_jax.native.choice import Unavailable, made
+from firenet_jax.native.foreign_call import register
+from firenet_jax.native.llvm import (
     FLOAT,
     INT,
     LANES,
@@ -41,9 +38,8 @@ from firenet_jax.machine_code import (
     vector,
     vectors,
 )
-from firenet_jax.network import BINS, CHANNELS, State
 
-assert CHANNELS == LANES
+CHANNELS, BINS = LANES, 5  # the network's
 PIXEL = 4 * CHANNELS  # bytes
 STEP = 8  # inputs of a convolution between two jumps; the event tensor's 5 become so many
 
@@ -149,7 +145,7 @@ def _same(f, pixel):
 
 
 def _prediction(f, pixel):
-    return f.total(f.b.fmul(pixel, f.prediction), f.offset)
+    return f.reduce_add(f.b.fmul(pixel, f.prediction), f.offset)
 
 
 STAGES = [
@@ -316,7 +312,7 @@ def _multiply(module: Module, size: Size) -> Code:
                     outputs = f.load(VECTOR, kernel, f.times(i, STEP * PIXEL), c * PIXEL)
                     numbers = f.at(tiles, f.times(i, 4 * STEP), 4 * c)
                     values = [
-                        f.fma(f.everywhere(f.load(FLOAT, numbers, t * PIXEL)), outputs, value)
+                        f.fma(f.splat(f.load(FLOAT, numbers, t * PIXEL)), outputs, value)
                         for t, value in enumerate(values)
                     ]
                 return values
@@ -381,7 +377,7 @@ def _arrays(f: Function, size: Size, pointers, image) -> dict:
 def _rows(f: Function, size: Size, part):
     """Of this part: the first row, and the one after the last."""
     first = f.times(part, ROWS.tile)
-    return first, f.smaller(f.b.add(first, integer(ROWS.tile)), size.height)
+    return first, f.min(f.b.add(first, integer(ROWS.tile)), size.height)
 
 
 def _border(f: Function, size: Size, map, part) -> None:
@@ -437,7 +433,7 @@ def _normalised(f, size, arrays):
     """As `tensors.normalise`."""
     deviation = _deviation(f, size, arrays)
     variance = f.b.fdiv(_total(f, size, arrays, "squares"), _count(f, size, arrays))
-    inverse = f.b.fdiv(vector(1), f.numbers("sqrt", variance))
+    inverse = f.b.fdiv(vector(1), f.intrinsic("sqrt", variance))
     scale = f.b.select(f.b.fcmp_ordered(">=", variance, vector(1e-12)), inverse, vector(0))
     return lambda numbers: f.b.fmul(deviation(numbers), scale)
 
@@ -448,11 +444,11 @@ def _total(f: Function, size: Size, arrays: dict, moment: str):
     def add(i, total):
         return [f.b.fadd(total[0], f.load(FLOAT, arrays[moment], f.times(i, 4)))]
 
-    return f.everywhere(f.loop(0, size.down, add, [number(0)])[0])
+    return f.splat(f.loop(0, size.down, add, [number(0)])[0])
 
 
 def _count(f: Function, size: Size, arrays: dict):
-    return f.larger(_total(f, size, arrays, "count"), vector(1))
+    return f.max(_total(f, size, arrays, "count"), vector(1))
 
 
 def _moments(module: Module, size: Size, terms: dict[str, Callable]) -> Code:
@@ -466,13 +462,13 @@ def _moments(module: Module, size: Size, terms: dict[str, Callable]) -> Code:
     term_of = [term(f, size, arrays) for term in terms.values()]
 
     def add(i, sums):
-        numbers = f.load_some(f.at(events, f.times(i, PIXEL)), f.b.sub(count, f.times(i, LANES)))
+        numbers = f.masked_load(f.at(events, f.times(i, PIXEL)), f.b.sub(count, f.times(i, LANES)))
         return [f.b.fadd(sum_, term(numbers)) for sum_, term in zip(sums, term_of, strict=True)]
 
     vectors = f.b.sdiv(f.b.add(count, integer(LANES - 1)), integer(LANES))
     sums = f.loop(0, vectors, add, [vector(0)] * len(terms))
     for name, sum_ in zip(terms, sums, strict=True):
-        f.store(f.total(sum_, number(0)), arrays[name], f.times(part, 4))
+        f.store(f.reduce_add(sum_, number(0)), arrays[name], f.times(part, 4))
     f.b.ret_void()
     return f.function
 
@@ -490,7 +486,7 @@ def _events(module: Module, size: Size, becomes: Callable) -> Code:
 
         def pixel(x, _):
             here = f.at(numbers, f.times(x, 4 * BINS))
-            f.store(becomes(f.load_some(here, integer(BINS))), line, f.times(x, PIXEL))
+            f.store(becomes(f.masked_load(here, integer(BINS))), line, f.times(x, PIXEL))
 
         f.loop(0, size.width, pixel)
 
@@ -514,17 +510,17 @@ def _stage(
     f = Function(module, name, [POINTER, INT, INT])
     pointers, image, part = f.arguments
     arrays = _arrays(f, size, pointers, image)
-    transformed = f.local(len(stage.sources) * PLACES * size.place)
-    sums = f.local(PLACES * size.place)
-    pixels = [f.local(ROWS.tile * COLUMNS.tile * size.place) for _ in stage.layers]
-    f.exists = f.everywhere(f.load(FLOAT, arrays["exists"]))
+    transformed = f.alloca(len(stage.sources) * PLACES * size.place)
+    sums = f.alloca(PLACES * size.place)
+    pixels = [f.alloca(ROWS.tile * COLUMNS.tile * size.place) for _ in stage.layers]
+    f.exists = f.splat(f.load(FLOAT, arrays["exists"]))
     f.prediction = f.load(VECTOR, arrays["weights"], _weights(len(STAGES)))
     f.offset = f.load(FLOAT, arrays["weights"], _weights(len(STAGES)) + PIXEL)
     top, bottom = _rows(f, size, part)
 
     def finish(layer, bias, pixels, left, fresh):
         """What the layer makes of the pixels of the block that are in the image."""
-        right = f.smaller(f.b.sub(integer(size.width), left), COLUMNS.tile * size.block)
+        right = f.min(f.b.sub(integer(size.width), left), COLUMNS.tile * size.block)
 
         def row(y, _):
             line = f.b.add(f.times(y, size.line), f.times(left, PIXEL))
@@ -549,7 +545,7 @@ def _stage(
         # The last block begins early enough to end with the row; what the one before it has
         # finished is left alone, because a state changes in place.
         wanted = f.times(i, size.block)
-        first = f.smaller(wanted, size.across - size.block)
+        first = f.min(wanted, size.across - size.block)
         left, fresh = f.times(first, COLUMNS.tile), f.times(f.b.sub(wanted, first), COLUMNS.tile)
         corner = f.b.add(f.times(top, size.line), f.times(left, PIXEL))
         maps, inputs = len(stage.sources), _inputs(stage)
@@ -584,12 +580,8 @@ def _weights(stage: int) -> int:
     return sum(len(each.layers) * _weights_of_layer(each) for each in STAGES[:stage])
 
 
-@cache
 def _target(height: int, width: int, normalise: bool) -> str:
-    """The name by which XLA knows the step for images of this size, compiled when first asked.
-
-    Raises RuntimeError where XLA's interface is no longer the one of `foreign_call`.
-    """
+    """Compiles the step for images of this size -> the name by which XLA knows it."""
     size, module = Size(height, width), Module()
     if normalise:
         moments = [{"count": _voted, "sum": _itself}, {"squares": _square}]
@@ -613,57 +605,49 @@ def _target(height: int, width: int, normalise: bool) -> str:
 # --- To JAX ------------------------------------------------------------------------------------
 
 
-def supports(height: int, width: int, normalise: bool = False) -> bool:
-    """Whether `step` runs for images of this size, here; compiles it."""
-    if vectors() == 0 or jax.default_backend() != "cpu":
-        return False
-    with _compiling:  # threads that ask together: a name is registered once
-        try:
-            _target(height, width, normalise)
-        except RuntimeError as error:
-            warnings.warn(f"reconstruction is slower than it could be here: {error}", stacklevel=2)
-            return False
-    return True
-
-
-_compiling = Lock()
-
-
-def enclose(state: State) -> State:
+def enclose(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
     """States as `step` keeps them: maps, (B, H + 2, W + 2, 16), H and W those of whole tiles."""
-    batch, height, width, _ = state.g1.shape
+    if 0 in state[0].shape:
+        raise Unavailable
+    batch, height, width, _ = state[0].shape
     below, right = -height % ROWS.tile, -width % COLUMNS.tile
     sides = (0, 0), (1, 1 + below), (CHANNELS, (1 + right) * CHANNELS)  # quicker than four axes
     shape = batch, height + 2 + below, width + 2 + right, CHANNELS
-    return State(*(jnp.pad(h.reshape(batch, height, -1), sides).reshape(shape) for h in state))
+    g1, g2 = (jnp.pad(h.reshape(batch, height, -1), sides).reshape(shape) for h in state)
+    return g1, g2
 
 
-def interior(state: State, height: int, width: int) -> State:
+def interior(state: tuple[jax.Array, jax.Array], height: int, width: int):
     """The other way: (B, H, W, 16)."""
-    return State(*(h[:, 1 : 1 + height, 1 : 1 + width] for h in state))
+    g1, g2 = (h[:, 1 : 1 + height, 1 : 1 + width] for h in state)
+    return g1, g2
 
 
 def step(
     packed: jax.Array,
-    state: State,
+    state: tuple[jax.Array, jax.Array],
     tensor: jax.Array,
     exists: jax.Array | None = None,
     normalise: bool = False,
-) -> tuple[State, jax.Array]:
+) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
     """One window, as `network.step`, of packed parameters and an enclosed state; no gradient.
 
+    All arrays are float32, of at least one pixel, but exists (B,) bool.
     normalise: the tensor first, as `tensors.normalise` does.
+    Raises Unavailable where there is no machine code for it.
     """
     batch, height, width, _ = tensor.shape
     exists = jnp.ones(batch) if exists is None else exists
+    if vectors() == 0:
+        raise Unavailable
     size = Size(height, width)
     shapes = [h.shape for h in state]
     shapes += [(batch, height, width), (batch * size.inner // 4,)]
     call = jax.ffi.ffi_call(
-        _target(height, width, normalise),
+        made(_target, height, width, normalise),
         [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes],
         input_output_aliases={3: 0, 4: 1},
         vmap_method="sequential",
     )
     g1, g2, image, _ = call(tensor, packed, exists.astype(jnp.float32), *state)
-    return State(g1, g2), image
+    return (g1, g2), image

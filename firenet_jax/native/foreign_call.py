@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import jax
 
-from firenet_jax.machine_code import (
+from firenet_jax.native.llvm import (
     INT,
     INT32,
     NULL,
@@ -19,7 +19,7 @@ from firenet_jax.machine_code import (
     Code,
     Function,
     Module,
-    address,
+    compiled,
     integer,
     integer32,
 )
@@ -55,7 +55,7 @@ def register(
     """
     work = _work(module, stages, parts)
     _handler(module, work, len(stages), parts, arguments, results)
-    handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(address(module, "handler"))
+    handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(compiled(module)("handler"))
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
 
 
@@ -131,7 +131,7 @@ def _wait(f: Function, is_missing: Callable) -> None:
     f.b.branch(again)
 
     f.b.position_at_end(sleep)
-    doubled = f.smaller(f.b.sub(times, integer(awake)), doublings)
+    doubled = f.min(f.b.sub(times, integer(awake)), doublings)
     time = f.b.trunc(f.b.shl(integer(microseconds), doubled), INT32)
     f.b.call(f.external("usleep", INT32, INT32), [time])
     f.b.branch(again)
@@ -165,7 +165,7 @@ def _handler(module, work, stages: int, parts: int, arguments: int, results: lis
     context, api = f.load(POINTER, frame, FRAME_CONTEXT), f.load(POINTER, frame, FRAME_API)
 
     def structure(*values):
-        memory = f.local(8 * (2 + len(values)))
+        memory = f.alloca(8 * (2 + len(values)))
         for i, value in enumerate((integer(16 + 8 * len(values)), NULL, *values)):
             f.store(value, memory, 8 * i)
         return memory
@@ -184,10 +184,10 @@ def _handler(module, work, stages: int, parts: int, arguments: int, results: lis
     buffers += [f.load(POINTER, outputs, 8 * i) for i in results]
     images = f.load(INT, f.load(POINTER, buffers[0], BUFFER_DIMENSIONS))
 
-    number = f.local(8)
+    number = f.alloca(8)
     f.store(integer(1), number)
     succeeds(API_THREADS, number)  # else XLA has no threads to share: one
-    threads = f.smaller(f.load(INT, number), f.times(images, parts))
+    threads = f.min(f.load(INT, number), f.times(images, parts))
 
     size = COUNTERS + 3 * stages * COUNTER
     record = f.b.call(f.external("malloc", POINTER, INT), [integer(size)])

@@ -15,6 +15,7 @@ from numpy.polynomial import Chebyshev, Polynomial
 
 LANES = 16
 INT, INT32, FLOAT, POINTER = ir.IntType(64), ir.IntType(32), ir.FloatType(), ir.PointerType()
+INT8, BIT = ir.IntType(8), ir.IntType(1)
 VECTOR, INTS = ir.VectorType(FLOAT, LANES), ir.VectorType(INT32, LANES)
 VECTOR_BYTES = 4 * LANES
 ALIGNED = {VECTOR: VECTOR_BYTES, POINTER: 8, INT: 8, INT32: 4, FLOAT: 4}
@@ -76,20 +77,36 @@ class Function:
     def load(self, kind, pointer, *byte_offsets):
         return self.b.load(self.at(pointer, *byte_offsets), typ=kind, align=ALIGNED[kind])
 
-    def load_some(self, pointer, count):
+    def masked_load(self, pointer, count):
         """A vector of the numbers from here on, zeros from the count-th (int64) on."""
         mask = ir.VectorType(ir.IntType(1), LANES)
         load = self.external(
             f"llvm.masked.load.v{LANES}f32.p0", VECTOR, POINTER, INT32, mask, VECTOR
         )
         lanes = ir.Constant(INTS, list(range(LANES)))
-        exist = self.b.icmp_signed("<", lanes, self.everywhere(self.b.trunc(count, INT32)))
+        exist = self.b.icmp_signed("<", lanes, self.splat(self.b.trunc(count, INT32)))
         return self.b.call(load, [pointer, integer32(ALIGNED[FLOAT]), exist, vector(0)])
 
     def store(self, value, pointer, *byte_offsets):
         self.b.store(value, self.at(pointer, *byte_offsets), align=ALIGNED[value.type])
 
-    def local(self, size: int):
+    def load_unaligned(self, kind, pointer, *byte_offsets):
+        """From an array that begins and whose rows begin at no round address."""
+        return self.b.load(self.at(pointer, *byte_offsets), typ=kind, align=ALIGNED[FLOAT])
+
+    def store_unaligned(self, value, pointer, *byte_offsets):
+        self.b.store(value, self.at(pointer, *byte_offsets), align=ALIGNED[FLOAT])
+
+    def memset(self, pointer, size):
+        """So many bytes of zeros."""
+        fill = self.external("llvm.memset.p0.i64", VOID, POINTER, INT8, INT, BIT)
+        self.b.call(fill, [pointer, ir.Constant(INT8, 0), integer(size), ir.Constant(BIT, 0)])
+
+    def memcpy(self, target, source, size):
+        copy = self.external("llvm.memcpy.p0.p0.i64", VOID, POINTER, POINTER, INT, BIT)
+        self.b.call(copy, [target, source, integer(size), ir.Constant(BIT, 0)])
+
+    def alloca(self, size: int):
         """So many bytes that last until the function returns."""
         with self.b.goto_entry_block():
             memory = self.b.alloca(VECTOR, -(-size // VECTOR_BYTES))
@@ -104,7 +121,7 @@ class Function:
     def less(self, a, b):
         return self.b.icmp_signed("<", integer(a), integer(b))
 
-    def smaller(self, a, b):
+    def min(self, a, b):
         return self.b.select(self.less(a, b), integer(a), integer(b))
 
     # Control
@@ -135,37 +152,37 @@ class Function:
 
     # Vectors
 
-    def numbers(self, name: str, *arguments):
+    def intrinsic(self, name: str, *arguments):
         """One of LLVM's functions of numbers, for each lane."""
         kinds = [VECTOR] * len(arguments)
         return self.b.call(self.external(f"llvm.{name}.v{LANES}f32", VECTOR, *kinds), arguments)
 
     def fma(self, a, b, c):
-        return self.numbers("fma", a, b, c)
+        return self.intrinsic("fma", a, b, c)
 
-    def everywhere(self, number):
+    def splat(self, number):
         undefined = ir.Constant(ir.VectorType(number.type, LANES), ir.Undefined)
         first = self.b.insert_element(undefined, number, integer32(0))
         return self.b.shuffle_vector(first, undefined, ir.Constant(INTS, [0] * LANES))
 
-    def total(self, lanes, start):
+    def reduce_add(self, lanes, start):
         name = f"llvm.vector.reduce.fadd.v{LANES}f32"
         add = self.external(name, FLOAT, FLOAT, VECTOR)
         return self.b.call(add, [start, lanes], fastmath=("reassoc",))
 
-    def larger(self, x, bound):
-        """Not a number stays so."""
+    def max(self, x, bound):
+        """Of vectors; not a number stays so."""
         return self.b.select(self.b.fcmp_ordered("<", x, bound), bound, x)
 
     def is_not_zero(self, x):
         return self.b.fcmp_unordered("!=", x, vector(0))
 
     def relu(self, x):
-        return self.larger(x, vector(0))
+        return self.max(x, vector(0))
 
     def exp(self, x):
         """2^n e^r, r between half of -ln 2 and of ln 2."""
-        x = self.larger(x, vector(-87))
+        x = self.max(x, vector(-87))
         x = self.b.select(self.b.fcmp_ordered(">", x, vector(88)), vector(88), x)
         # Added to a number this large, a fraction is rounded away; n is in the last bits.
         large = vector(1.5 * 2**23)
@@ -200,13 +217,13 @@ def vectors() -> int:
 _engines = []  # what was compiled stays for as long as the process
 
 
-def address(module: Module, name: str) -> int:
-    """Compiles a module; where its function is."""
+def compiled(module: Module) -> Callable[[str], int]:
+    """Compiles a module -> where its function of a name is; only public ones have names."""
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
     module.triple = binding.get_process_triple()
-    compiled = binding.parse_assembly(str(module))
-    compiled.link_in(binding.parse_assembly(CALL_POINTER))
+    code = binding.parse_assembly(str(module))
+    code.link_in(binding.parse_assembly(CALL_POINTER))
     machine = binding.Target.from_triple(module.triple).create_target_machine(
         cpu=binding.get_host_cpu_name(),
         # Some processors have vectors of 512 bits of which LLVM would use only half.
@@ -216,8 +233,8 @@ def address(module: Module, name: str) -> int:
     passes = binding.create_pass_builder(
         machine, binding.create_pipeline_tuning_options(speed_level=1)
     )
-    passes.getModulePassManager().run(compiled, passes)
-    engine = binding.create_mcjit_compiler(compiled, machine)
+    passes.getModulePassManager().run(code, passes)
+    engine = binding.create_mcjit_compiler(code, machine)
     engine.finalize_object()
     _engines.append(engine)
-    return engine.get_function_address(name)
+    return engine.get_function_address

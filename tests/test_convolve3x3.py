@@ -1,0 +1,196 @@
+"""The machine code of a convolution and of its gradients against XLA's and float64."""
+
+import ctypes
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+pytest.importorskip("llvmlite")
+
+from firenet_jax import convolution, native
+from firenet_jax.native import Unavailable, llvm
+from firenet_jax.native.convolve3x3 import _convolution, _parts, _sums, _total
+
+pytestmark = pytest.mark.skipif(
+    jax.default_backend() != "cpu" or llvm.vectors() == 0,
+    reason="no machine code for this processor",
+)
+
+# B, H, W, inputs, outputs: less than a tile and a register, one more than that, training's.
+SHAPES = [
+    (1, 1, 1, 1, 16),
+    (2, 7, 9, 5, 16),
+    (1, 3, 2, 16, 32),
+    (3, 13, 31, 32, 16),
+    (2, 30, 50, 32, 32),
+    (1, 4, 3, 20, 48),
+    (5, 9, 29, 16, 16),
+    (1, 6, 200, 7, 64),
+    (1, 200, 1, 16, 16),
+    (2, 96, 96, 16, 32),
+]
+
+
+def random_case(batch, height, width, inputs, outputs, kind=np.float32):
+    rng = np.random.default_rng(height + width)
+    shapes = (batch, height, width, inputs), (3, 3, inputs, outputs)
+    arrays = [rng.normal(size=shape) for shape in (*shapes, (batch, height, width, outputs))]
+    return [array.astype(kind) for array in arrays]
+
+
+def exact(image, kernel, gradient):
+    """In float64: the convolution, and the kernel's gradient."""
+    image, kernel, gradient = (np.asarray(x, np.float64) for x in (image, kernel, gradient))
+    height, width = image.shape[1:3]
+    padded = np.pad(image, ((0, 0), (1, 1), (1, 1), (0, 0)))
+    windows = np.stack(
+        [padded[:, i : i + height, j : j + width] for i in range(3) for j in range(3)]
+    )
+    result = np.einsum("kbyxi,kio->byxo", windows, kernel.reshape(9, *kernel.shape[2:]))
+    by_kernel = np.einsum("kbyxi,byxo->kio", windows, gradient, optimize=True)
+    return result, by_kernel.reshape(kernel.shape)
+
+
+def assert_same(found, expected):
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+def test_equals_float64_and_xla(shape):
+    image, kernel, gradient = random_case(*shape)
+    result, by_kernel = exact(image, kernel, gradient)
+    found = native.convolve(jnp.asarray(image), jnp.asarray(kernel))
+    assert_same(found, result)
+    assert_same(found, np.asarray(convolution._plain(image, kernel)))
+    found = native.kernel_gradient(*map(jnp.asarray, (image, kernel, gradient)))
+    assert_same(found, by_kernel)
+    assert_same(found, np.asarray(convolution._xla_kernel_gradient(image, kernel, gradient)))
+
+
+def test_on_processors_with_vectors_of_256_bits(monkeypatch):
+    """The instructions of one run on all that have more."""
+    features = llvm.binding.FeatureMap({"avx2": True, "fma": True})
+    monkeypatch.setattr(llvm.binding, "get_host_cpu_name", lambda: "haswell")
+    monkeypatch.setattr(llvm.binding, "get_host_cpu_features", lambda: features)
+    for shape in [(2, 10, 33, 5, 16), (1, 9, 21, 32, 32)]:
+        image, kernel, gradient = random_case(*shape)
+        result, by_kernel = exact(image, kernel, gradient)
+        assert_same(native.convolve(jnp.asarray(image), jnp.asarray(kernel)), result)
+        found = native.kernel_gradient(*map(jnp.asarray, (image, kernel, gradient)))
+        assert_same(found, by_kernel)
+
+
+def layers(convolve, kernels, image):
+    """A scan over two layers, as the network has them, with what is kept computed again."""
+
+    def body(h, x):
+        def once(h, x):
+            for kernel in kernels:
+                h = jnp.tanh(convolve(h + x, kernel))
+            return h
+
+        h = jax.checkpoint(once)(h, x)
+        return h, h.sum()
+
+    return (jax.lax.scan(body, jnp.zeros_like(image[0]), image)[1] ** 2).sum()
+
+
+def test_in_scans_maps_and_computed_again():
+    rng = np.random.default_rng(0)
+    kernels = jnp.asarray(0.1 * rng.normal(size=(2, 3, 3, 16, 16)), jnp.float32)
+    images = jnp.asarray(rng.normal(size=(3, 4, 2, 11, 13, 16)), jnp.float32)
+    ours = jax.value_and_grad(partial(layers, convolution.convolve), (0, 1))
+    theirs = jax.value_and_grad(partial(layers, convolution._plain), (0, 1))
+    for transform in (
+        lambda f: lambda kernels, images: f(kernels, images[0]),
+        lambda f: jax.vmap(f, (None, 0)),
+        lambda f: lambda kernels, images: jax.lax.map(partial(f, kernels), images),
+        lambda f: lambda kernels, images: jax.vmap(f)(jnp.stack([kernels] * 3), images),
+    ):
+        program = jax.jit(transform(ours))
+        found, expected = program(kernels, images), jax.jit(transform(theirs))(kernels, images)
+        jax.tree.map(assert_same, *map(lambda t: jax.tree.map(np.asarray, t), (found, expected)))
+    assert "custom_call" in program.lower(kernels, images).as_text()
+
+
+@pytest.mark.parametrize("kind", [jnp.bfloat16, jnp.float16])
+def test_other_types_are_xlas(kind):
+    image, kernel, gradient = (jnp.asarray(x, kind) for x in random_case(1, 5, 7, 16, 16))
+    found, back = jax.vjp(convolution.convolve, image, kernel)
+    assert found.dtype == kind
+    assert_same(np.asarray(found, np.float32), np.asarray(convolution._plain(image, kernel), "f4"))
+    assert [x.dtype for x in back(gradient)] == [kind, kind]
+
+
+@pytest.mark.parametrize(
+    "image, kernel",
+    [((1, 5, 7, 4), (3, 3, 4, 5)), ((1, 5, 7, 4), (3, 5, 4, 16)), ((0, 5, 7, 4), (3, 3, 4, 16))],
+)
+def test_what_it_does_not_compute(image, kernel):
+    with pytest.raises(Unavailable):
+        native.convolve(jnp.zeros(image), jnp.zeros(kernel))
+    assert convolution.convolve(jnp.zeros(image), jnp.zeros(kernel)).shape == (
+        *image[:3],
+        kernel[3],
+    )
+
+
+@pytest.mark.parametrize("where", ["image", "kernel"])
+@pytest.mark.parametrize("what", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_goes_where_it_goes_in_xla(where, what):
+    image, kernel, _ = random_case(1, 6, 30, 16, 16)
+    if where == "image":
+        image[0, 2, 29, 3] = what
+    else:
+        kernel[0, 1, 3, 4] = what
+    found = native.convolve(jnp.asarray(image), jnp.asarray(kernel))
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(convolution._plain(image, kernel)))
+
+
+CANARY, SIDE = np.nan, 64
+
+
+def surrounded(array):
+    """The same array with numbers that nobody may change, or would use unseen, on both sides."""
+    memory = np.full(array.size + 2 * SIDE, CANARY, np.float32)
+    memory[SIDE:-SIDE] = array.ravel()
+    return memory
+
+
+@pytest.mark.parametrize("shape", SHAPES[:8], ids=str)
+def test_nothing_is_read_or_written_beside_the_arrays(shape):
+    batch, height, width, inputs, outputs = shape
+    image, kernel, gradient = random_case(*shape)
+    result, by_kernel = exact(image, kernel, gradient)
+    parts = _parts(height)
+
+    def run(write, arrays):
+        module = llvm.Module()
+        stages = write(module)
+        for stage in stages:
+            stage.linkage = ""
+        memory = [surrounded(array) for array in arrays]
+        before = [each.copy() for each in memory]
+        pointers = np.array([each[SIDE:].ctypes.data for each in memory], np.uint64)
+        address = llvm.compiled(module)
+        signature = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
+        for stage in [signature(address(stage.name)) for stage in stages]:
+            for part in np.random.default_rng(0).permutation(batch * parts):
+                stage(pointers.ctypes.data, *divmod(int(part), parts))
+        for each, old in zip(memory, before, strict=True):
+            np.testing.assert_array_equal(each[:SIDE], old[:SIDE])
+            np.testing.assert_array_equal(each[-SIDE:], old[-SIDE:])
+        return [each[SIDE:-SIDE] for each in memory]
+
+    *_, found = run(
+        lambda module: [_convolution(module, *shape[1:])], [image, kernel, np.zeros_like(gradient)]
+    )
+    assert_same(found.reshape(result.shape), result)
+    *_, found = run(
+        lambda module: [_sums(module, *shape[1:]), _total(module, batch, height, inputs, outputs)],
+        [image, gradient, np.zeros((batch * parts, kernel.size)), np.zeros_like(kernel)],
+    )
+    assert_same(found.reshape(kernel.shape), by_kernel)
