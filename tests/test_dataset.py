@@ -381,7 +381,7 @@ def bad_lines(folder):
         ("-o taken", "is not empty"),
         ("-o file", "choose another name"),
         ("-o a.h5", "go into a folder"),
-        ("-o file/set", "cannot write there"),
+        ("-o file/set", "cannot make this folder"),
         ("-o damaged", "is damaged"),
         ("-o other", "scene.speed was [20.0, 100.0], now [3.0, 1000.0], seconds was 0.2, now 2.0"),
         ("-o out --video clip.mp4", "out.h5"),

@@ -17,7 +17,7 @@ from firenet_jax.video import write_video
 
 SCRIPT = """
 import resource, sys
-import h5py, jax, orbax.checkpoint  # what writes files of its own when it is imported, does so first
+import h5py, jax, orbax.checkpoint  # before the limit: they write files of their own
 from firenet_jax import cli
 limit, *arguments = sys.argv[1:]
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit), int(limit)))
