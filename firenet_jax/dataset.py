@@ -574,7 +574,7 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
     """
     first = last = None
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path), metadata_errors="replace") as container:
             if not container.streams.video or container.format.name == "tty":  # any text is
                 raise ValueError(f"{path}: holds no video, only sound or text: name a video file")
             stream = container.streams.video[0]
@@ -596,8 +596,8 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
                 rgb = frame.to_ndarray(format="rgb24", width=width, height=height)
                 grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
                 yield Picture(time, np.round(grey).astype(np.uint8), None)
-    except (av.FFmpegError, OSError) as error:
+    except (av.FFmpegError, OSError, UnicodeDecodeError) as error:  # names in it that are no text
+        reason = getattr(error, "strerror", None) or error
         raise ValueError(
-            f"{path}: cannot be read as a video ({error.strerror or error}): name a file that "
-            "ffmpeg can play"
+            f"{path}: cannot be read as a video ({reason}): name a file that ffmpeg can play"
         ) from error

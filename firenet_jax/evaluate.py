@@ -184,7 +184,7 @@ def run(settings: Evaluate) -> dict:
     size = parse_size(settings.sensor_size)
     if settings.output.is_file():
         raise OutputError(f"{settings.output} is a file: choose another name for the folder")
-    recordings = {name: open_recording(path, size) for name, path in sequences.items()}
+    recordings = {name: open_recording(path, size, True) for name, path in sequences.items()}
     shared = describe(settings, learned)
     records = {
         (name, method.name): describe_one(shared, recording, method)

@@ -109,6 +109,11 @@ class Recording:
         return self.height * self.width
 
 
+def counted(number: int, noun: str) -> str:
+    """1 picture, 2,000 pictures"""
+    return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
 def event_number(row: int) -> str:
     """The place of an event, counted from 1, in a file that has no lines."""
     return f"event {row + 1}"
@@ -145,7 +150,7 @@ def checked(
             except RecordingError as error:
                 if strict or rows == dropped:
                     raise
-                say(f"{error}; the {rows - dropped:,} events before that are read", rows)
+                say(f"{error}; what comes before is read: {counted(rows - dropped, 'event')}", rows)
                 return
             if chunk is None:
                 return
@@ -175,7 +180,7 @@ def checked(
                 yield events
     finally:
         if dropped:
-            say(f"{first_error}; left out: {dropped:,} of {rows:,} events", rows)
+            say(f"{first_error}; left out: {dropped:,} of {counted(rows, 'event')}", rows)
 
 
 def _is_right(events: Events, last: int, height: int | None, width: int | None) -> bool:

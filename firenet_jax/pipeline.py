@@ -101,6 +101,9 @@ class Reconstruct:
     """Pictures per second of a video (windows of events have no rate of their own)."""
     sensor_size: str | None = None
     """WIDTHxHEIGHT of the sensor, such as 240x180, where the recording does not say it."""
+    strict: bool = False
+    """Refuse a recording with a bad row or damage, instead of leaving out what cannot be read (at
+    most one event in a thousand) and reading up to the damage."""
     chunk: int | None = None
     """Windows a recording gives the device at once (default: 16; on a CPU 8 of a sensor of up to
     65,536 pixels, 4 of larger ones)."""
@@ -200,7 +203,7 @@ def run(settings: Reconstruct) -> list[Path]:
     size = parse_size(settings.sensor_size)
     jobs = []
     for path, output in zip(settings.recordings[mine], outputs, strict=True):
-        recording = open_recording(path, size)
+        recording = open_recording(path, size, settings.strict)
         job = Job(recording, output, describe(settings, recording, weights))
         if is_done(job):
             logger.warning("%s: done by the run that this one continues", output)

@@ -1066,6 +1066,9 @@ def test_wrong_bags(new_bag, tmp_path):
     bag.close()
     refused(path, "event 2: time runs backwards")
     if path.is_file():
+        path, bag = new_bag("d")
+        bag.events("/dvs/events", EPOCH, T[:2] + EPOCH, X[:2], Y[:2], P[:2])
+        bag.close()
         refused(write(tmp_path / "cut.bag", path.read_bytes()[:-200]), "cannot be read")
         refused(write(tmp_path / "text.bag", "hello"), "cannot be read")
     else:
@@ -1189,7 +1192,7 @@ def test_half_a_sample_gives_half_of_its_events(recordings, tmp_path, caplog, na
         )
     if name.endswith(".es"):
         return  # the file does not say how long it is
-    assert caplog.text.count(f"the {len(events):,} events before that are read") == 1
+    assert caplog.text.count(f"what comes before is read: {len(events):,} events") == 1
     refused(recording.path, "cut off" if "bag" not in name else "ends early", size=(720, 1280))
 
 

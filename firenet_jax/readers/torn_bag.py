@@ -48,13 +48,12 @@ class Torn:
         return list(self.known.values())
 
     def messages(self, connections, start: int | None = None) -> Iterator[tuple]:
-        """(connection, time of recording in ns, bytes), not before `start`. Raises ValueError
-        where the bag ends within a record."""
+        """(connection, time of recording in ns, bytes), not before `start`. Raises ValueError at
+        the end: a bag without an index was not closed."""
         for connection, time, data in self._messages():
             if connection in connections and time >= (start or 0):
                 yield connection, time, data
-        if self.ended is not None:
-            raise ValueError("it has no index and ends early") from self.ended
+        raise ValueError("it has no index, so it ends early") from self.ended
 
     def _messages(self) -> Iterator[tuple]:
         with open(self.path, "rb") as file:
