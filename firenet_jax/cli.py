@@ -97,11 +97,9 @@ def main(arguments: list[str] | None = None) -> int:
             config=(tyro.conf.OmitArgPrefixes,),
         )
         command.run(parsed)
-    except KeyboardInterrupt:
-        print(
-            "firenet: interrupted; a folder of pictures or sequences goes on when run again",
-            file=sys.stderr,
-        )
+    except KeyboardInterrupt as error:
+        goes_on = str(error) or "a folder of pictures or sequences goes on when run again"
+        print(f"firenet: interrupted; {goes_on}", file=sys.stderr)
         return 130
     except (ValueError, OSError, MemoryError, RuntimeError) as error:
         no_room = isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)

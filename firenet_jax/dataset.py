@@ -16,6 +16,7 @@ A file appears under its name when it is whole, so a run that was interrupted go
 
 import dataclasses
 import importlib.metadata
+import io
 import itertools
 import json
 import math
@@ -37,8 +38,8 @@ from tqdm import tqdm
 from firenet_jax.events import Events, concatenate, parse_size
 from firenet_jax.files import (
     OutputError,
+    alone_in,
     differences,
-    locked,
     partial_name,
     write_text,
     writing,
@@ -162,17 +163,20 @@ def write_sequence(
     """
     beside = partial_name(path)
     try:
-        with writing(path), h5py.File(beside, "w") as file:
-            times, flows = _write_pictures(file, pictures, height, width)
-            count, facts = _write_events(file, events, times)
-            file.attrs.update(
-                sensor_resolution=np.array([height, width], np.int64),
-                num_imgs=len(times),
-                num_flow=flows,
-                source=source,
-                settings=json.dumps(settings or {}),
-                **facts,
-            )
+        with writing(path), beside.open("w+b", buffering=0) as opened:
+            disk = _Disk(opened)
+            with h5py.File(disk, "w") as file:
+                times, flows = _write_pictures(file, disk.during(pictures), height, width)
+                count, facts = _write_events(file, disk.during(events), times)
+                file.attrs.update(
+                    sensor_resolution=np.array([height, width], np.int64),
+                    num_imgs=len(times),
+                    num_flow=flows,
+                    source=source,
+                    settings=json.dumps(settings or {}),
+                    **facts,
+                )
+            disk.check()
         with writing(path):
             beside.replace(path)
     except BaseException:
@@ -182,6 +186,79 @@ def write_sequence(
         for stream in (events, pictures):
             getattr(stream, "close", bool)()  # of generators: ends their threads, closes files
     return count
+
+
+class _Disk:
+    """A file for h5py that takes every write, and tells afterwards of those that found no room.
+
+    HDF5 ends the whole process where the last writes of a file fail, which are those of closing
+    it. From the first write on that fails, all are kept in memory: what HDF5 still has in hand.
+    """
+
+    def __init__(self, file: io.FileIO):
+        self.file, self.at, self.error = file, 0, None
+        self.late: list[tuple[int, bytes]] = []  # (place, bytes) that are not on the disk
+
+    def check(self) -> None:
+        if self.error is not None:
+            raise self.error
+
+    def during(self, items: Iterable) -> Iterator:
+        """The same items, up to the first write that fails."""
+        for item in items:
+            self.check()
+            yield item
+
+    # What h5py asks of a file.
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        self.at = offset + (0, self.at, self.file.seek(0, 2))[whence]
+        return self.at
+
+    def tell(self) -> int:
+        return self.at
+
+    def write(self, data) -> int:
+        data = bytes(data)
+        try:
+            self.check()
+            self.file.seek(self.at)
+            rest = memoryview(data)
+            while rest:  # a disk that becomes full takes a part first
+                rest = rest[self.file.write(rest) :]
+        except OSError as error:
+            self.error = error
+            self.late.append((self.at, data))
+        self.at += len(data)
+        return len(data)
+
+    def read(self, size: int) -> bytes:
+        into = bytearray(size)
+        self.readinto(into)
+        return bytes(into)
+
+    def readinto(self, into) -> int:
+        into = memoryview(into).cast("B")
+        self.file.seek(self.at)
+        read = self.file.readinto(into)
+        into[read:] = bytes(len(into) - read)
+        for place, data in self.late:
+            first, last = max(place, self.at), min(place + len(data), self.at + len(into))
+            if first < last:
+                into[first - self.at : last - self.at] = data[first - place : last - place]
+        self.at += len(into)
+        return len(into)
+
+    def truncate(self, size: int) -> int:
+        try:
+            self.check()
+            self.file.truncate(size)
+        except OSError as error:
+            self.error = error
+        return size
+
+    def flush(self) -> None:
+        """Nothing waits: the file has no buffer."""
 
 
 def _write_pictures(file, pictures: Iterable[Picture], height, width) -> tuple[np.ndarray, int]:
@@ -263,8 +340,11 @@ def run(settings: Simulate) -> list[Path]:
     if settings.video is not None:
         return [simulate_clip(settings)]
     height, width = parse_size(settings.sensor_size or "240x180")
-    open_folder(settings)
-    with locked(settings.output):
+    folder = settings.output
+    if folder.is_file() or folder.suffix in CLIP_SUFFIXES:
+        raise OutputError(f"{folder}: sequences go into a folder: choose another name")
+    with alone_in(folder):
+        open_folder(settings)
         return write_sequences(settings, height, width)
 
 
@@ -316,12 +396,12 @@ def write_sequences(settings: Simulate, height: int, width: int) -> list[Path]:
             progress.update()
             mean = used / (done + 1)
             progress.set_postfix_str(
-                f"{mean / 1e6:.1f} MB each, {mean * len(work) / 1e9:.1f} GB in all", refresh=False
+                f"{in_words(mean)} each, {in_words(mean * len(work))} in all", refresh=False
             )
     print(
         f"{settings.output}: {split['train']} sequences for training and {split['validation']} "
         f"for validation, {settings.seconds:g} s each at {width}x{height}; {len(missing)} are new: "
-        f"{events:,} events, {used / 1e9:.2f} GB"
+        f"{events:,} events, {in_words(used)}"
     )
     return [path for path, *_ in work]
 
@@ -395,11 +475,9 @@ def describe(settings: Simulate) -> dict:
 
 
 def open_folder(settings: Simulate) -> None:
-    """Makes the output folder, or finds that it is one to go on with; else raises OutputError."""
+    """Finds that the folder is new or one to go on with; else raises OutputError."""
     folder, record = settings.output, describe(settings)
     kept = folder / "settings.json"
-    if folder.is_file() or folder.suffix in CLIP_SUFFIXES:
-        raise OutputError(f"{folder}: sequences go into a folder: choose another name")
     if kept.is_file():
         try:
             found = json.loads(kept.read_text())
@@ -429,12 +507,17 @@ def open_folder(settings: Simulate) -> None:
         ) from error
 
 
+def in_words(size: float) -> str:
+    """Bytes -> "2.1 GB", or MB where that would be less than one."""
+    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"
+
+
 def _check_room(folder: Path, needed: float) -> None:
     """Raises OutputError if so many bytes do not fit on the disk."""
     free = shutil.disk_usage(folder).free
     if needed > free:
         raise OutputError(
-            f"{folder}: the rest needs about {needed / 1e9:.1f} GB, but only {free / 1e9:.1f} GB "
+            f"{folder}: the rest needs about {in_words(needed)}, but only {in_words(free)} "
             "are free: make room or ask for fewer --sequences; a further run goes on from here"
         )
 
@@ -491,7 +574,7 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
     """
     first = last = None
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path), metadata_errors="replace") as container:
             if not container.streams.video or container.format.name == "tty":  # any text is
                 raise ValueError(f"{path}: holds no video, only sound or text: name a video file")
             stream = container.streams.video[0]
@@ -513,8 +596,8 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
                 rgb = frame.to_ndarray(format="rgb24", width=width, height=height)
                 grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
                 yield Picture(time, np.round(grey).astype(np.uint8), None)
-    except (av.FFmpegError, OSError) as error:
+    except (av.FFmpegError, OSError, UnicodeDecodeError) as error:  # names in it that are no text
+        reason = getattr(error, "strerror", None) or error
         raise ValueError(
-            f"{path}: cannot be read as a video ({error.strerror or error}): name a file that "
-            "ffmpeg can play"
+            f"{path}: cannot be read as a video ({reason}): name a file that ffmpeg can play"
         ) from error

@@ -45,6 +45,7 @@ from firenet_jax.equalise import Kind, equalise
 from firenet_jax.events import Frames, Recording, RecordingError, logger, parse_size
 from firenet_jax.files import (
     OutputError,
+    alone_in,
     differences,
     identity,
     named,
@@ -181,7 +182,9 @@ def run(settings: Evaluate) -> dict:
     )
     learned = None if settings.lpips is None else lpips.load(*settings.lpips)
     size = parse_size(settings.sensor_size)
-    recordings = {name: open_recording(path, size) for name, path in sequences.items()}
+    if settings.output.is_file():
+        raise OutputError(f"{settings.output} is a file: choose another name for the folder")
+    recordings = {name: open_recording(path, size, True) for name, path in sequences.items()}
     shared = describe(settings, learned)
     records = {
         (name, method.name): describe_one(shared, recording, method)
@@ -189,44 +192,45 @@ def run(settings: Evaluate) -> dict:
         for method in methods
         if isinstance(method, Method)
     }
-    done = open_folder(settings, records)
+    with alone_in(settings.output):
+        done = open_folder(settings, records)
 
-    plans: dict[str, Plan] = {}
-    gaps = {
-        (name, method.name): method.reason
-        for name in recordings
-        for method in methods
-        if isinstance(method, Missing)
-    }
-    for name, recording in recordings.items():
-        try:
-            plans[name] = plan(name, recording, settings)
-        except (Gap, RecordingError) as error:
-            logger.warning("%s: %s", recording.path, error)
-            gaps = {(name, method.name): str(error) for method in methods} | gaps
-    work = [key for key in records if key not in done and key not in gaps]
-    by_name = {method.name: method for method in methods}
-    total = sum(plans[name].last for name, _ in work)
-    with tqdm(total=total, unit="frames", smoothing=0.1, disable=None) as progress:
-        for name, method in work:
-            progress.set_postfix_str(f"{name}, {method}")
+        plans: dict[str, Plan] = {}
+        gaps = {
+            (name, method.name): method.reason
+            for name in recordings
+            for method in methods
+            if isinstance(method, Missing)
+        }
+        for name, recording in recordings.items():
             try:
-                found, pictures = evaluate(
-                    plans[name], by_name[method], settings, learned, progress
-                )
+                plans[name] = plan(name, recording, settings)
             except (Gap, RecordingError) as error:
-                logger.warning("%s, %s: %s", name, method, error)
-                gaps[name, method] = str(error)
-                continue
-            save(result_file(settings, name, method), records[name, method], found, pictures)
-            done[name, method] = found
-    if not any(key in done for key in records):
-        reason = next(iter(gaps.items()), (("", ""), "no method can run"))
-        raise RecordingError(f"nothing can be evaluated: {' / '.join(reason[0])}: {reason[1]}")
+                logger.warning("%s: %s", recording.path, error)
+                gaps = {(name, method.name): str(error) for method in methods} | gaps
+        work = [key for key in records if key not in done and key not in gaps]
+        by_name = {method.name: method for method in methods}
+        total = sum(plans[name].last for name, _ in work)
+        with tqdm(total=total, unit="frames", smoothing=0.1, disable=None) as progress:
+            for name, method in work:
+                progress.set_postfix_str(f"{name}, {method}")
+                try:
+                    found, pictures = evaluate(
+                        plans[name], by_name[method], settings, learned, progress
+                    )
+                except (Gap, RecordingError) as error:
+                    logger.warning("%s, %s: %s", name, method, error)
+                    gaps[name, method] = str(error)
+                    continue
+                save(result_file(settings, name, method), records[name, method], found, pictures)
+                done[name, method] = found
+        if not any(key in done for key in records):
+            reason = next(iter(gaps.items()), (("", ""), "no method can run"))
+            raise RecordingError(f"nothing can be evaluated: {' / '.join(reason[0])}: {reason[1]}")
 
-    results = summarise(settings, shared, plans, recordings, methods, done, gaps)
-    write_all(settings, results, plans, [key for key in records if key in done])
-    return results
+        results = summarise(settings, shared, plans, recordings, methods, done, gaps)
+        write_all(settings, results, plans, [key for key in records if key in done])
+        return results
 
 
 # ---- Data
@@ -437,9 +441,7 @@ def open_folder(settings: Evaluate, records: dict[tuple[str, str], dict]) -> dic
     Raises OutputError where a result was made by other settings, which `overwrite` replaces.
     """
     folder = settings.output
-    if folder.is_file():
-        raise OutputError(f"{folder} is a file: choose another name for the folder")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / "results").is_dir():
+    if any(folder.iterdir()) and not (folder / "results").is_dir():
         raise OutputError(f"{folder} is a folder of something else: choose another output")
     done = {}
     for key, record in records.items():

@@ -5,6 +5,7 @@ darker (p false, "OFF") by one contrast threshold at time t. Times are int64 mic
 seconds lose microseconds after 16 s. A recording is a stream of `Events` chunks in time order.
 """
 
+import bisect
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -21,9 +22,6 @@ REACH = 2**15  # pixels of a sensor's side at most: coordinates are int16
 
 class RecordingError(ValueError):
     """A recording cannot be used; the message is one sentence: file, place, found, what to do."""
-
-    before: "Events | None" = None
-    """Of the chunk in which the damage lies, the events before it, not checked."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -61,10 +59,28 @@ class Events:
         return cls.of([], [], [], [])
 
 
-def concatenate(chunks: list[Events]) -> Events:
+@dataclass(frozen=True, eq=False, slots=True)
+class Rows:
+    """N rows of a file, of which some are no events."""
+
+    events: Events  # N; of the rows that are none, any numbers
+    bad: np.ndarray  # (N,) bool, which these are
+    error: RecordingError  # what is to be said of the first of them
+
+    def __len__(self) -> int:
+        return len(self.events)
+
+
+def concatenate(chunks: "list[Events] | list[Events | Rows]") -> "Events | Rows":
     """Chunks -> one chunk; without copying when there is only one."""
     if len(chunks) == 1:
         return chunks[0]
+    errors = [chunk.error for chunk in chunks if isinstance(chunk, Rows)]
+    if errors:
+        whole = (isinstance(chunk, Events) for chunk in chunks)
+        masks = [np.zeros(len(c), bool) if w else c.bad for c, w in zip(chunks, whole, strict=True)]
+        events = [c if isinstance(c, Events) else c.events for c in chunks]
+        return Rows(concatenate(events), np.concatenate(masks), errors[0])
     columns = ([getattr(chunk, name) for chunk in chunks] for name in "txyp")
     return Events(*map(np.concatenate, columns))
 
@@ -93,72 +109,155 @@ class Recording:
         return self.height * self.width
 
 
+def counted(number: int, noun: str) -> str:
+    """1 picture, 2,000 pictures"""
+    return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
 def event_number(row: int) -> str:
     """The place of an event, counted from 1, in a file that has no lines."""
     return f"event {row + 1}"
 
 
+MOST_BAD = 1e-3  # of the rows may be left out: beyond, the fault is not that of single events
+
+
 def checked(
-    chunks: Iterable[Events],
+    chunks: "Iterable[Events | Rows]",
     path: Path,
     height: int | None,
     width: int | None,
     place: Callable[[int], str] = event_number,
+    strict: bool = True,
+    say: Callable[[str, int], None] = lambda what, count: None,
 ) -> Iterator[Events]:
-    """Passes events on up to the first one that cannot be, where it raises RecordingError.
+    """Passes events on, without rows that cannot be events, up to where there are too many.
 
     Time must not run backwards, within a chunk or between two; x and y must not be negative, nor
-    reach the sensor's width and height where these are known. `place(row)` names the row (counted
-    from 0 over the whole recording) in the words of the file: "line 7".
+    reach the sensor's width and height where these are known. Of rows that break the order of time
+    as few are left out as can be. What is left out, and damage that ends the reading early, goes
+    to `say(sentence, count)` at the end. Raises RecordingError for the first bad row where more
+    than one in a thousand of those read so far are bad, and for damage before the first event;
+    strict: for any. `place(row)` names the row (counted from 0 over the whole recording) in the
+    words of the file: "line 7".
     """
-    rows, last = 0, None
-    for events in _with_rest(chunks):
-        if len(events) == 0:
-            continue
-        t, x, y = events.t, events.x, events.y
-        last = t[0] if last is None else last
-        limits = [np.inf if size is None else size for size in (width, height)]
-        steps = np.diff(t)
-        if (
-            t[0] >= last
-            and (steps.size == 0 or steps.min() >= 0)
-            and min(x.min(), y.min()) >= 0
-            and x.max() < limits[0]
-            and y.max() < limits[1]
-        ):
-            rows, last = rows + len(events), t[-1]
-            yield events
-            continue
-        steps = np.insert(steps, 0, t[0] - last)
-        row = int(np.argmax((steps < 0) | (x < 0) | (x >= limits[0]) | (y < 0) | (y >= limits[1])))
-        if row:
-            yield events.select(slice(row))  # whoever stops before the damage never meets it
-        where = f"{path}, {place(rows + row)}"
-        if steps[row] < 0:
-            raise RecordingError(
-                f"{where}: time runs backwards, from {t[row] - steps[row]} to {t[row]} us: "
-                "sort the events by time, or --stop before"
-            )
-        name, value = ("y", y[row]) if 0 <= x[row] < limits[0] else ("x", x[row])
-        if value < 0:
-            raise RecordingError(
-                f"{where}: {name} is {value}, but coordinates are 0 or more: the file is damaged "
-                "or of another format"
-            )
-        raise RecordingError(
-            f"{where}: {name} is {value}, outside the sensor of {width}x{height} pixels: pass the "
-            "right --sensor-size WIDTHxHEIGHT"
-        )
-
-
-def _with_rest(chunks: Iterable[Events]) -> Iterator[Events]:
-    """Also what came before the damage within a chunk."""
+    rows, dropped, last, first_error = 0, 0, None, None
     try:
-        yield from chunks
-    except RecordingError as error:
-        if error.before is not None:
-            yield error.before
-        raise
+        chunks = iter(chunks)
+        while True:
+            try:
+                chunk = next(chunks, None)
+            except RecordingError as error:
+                if strict or rows == dropped:
+                    raise
+                say(f"{error}; what comes before is read: {counted(rows - dropped, 'event')}", rows)
+                return
+            if chunk is None:
+                return
+            events = chunk if isinstance(chunk, Events) else chunk.events
+            if len(events) == 0:
+                continue
+            last = events.t[0] if last is None else last
+            if isinstance(chunk, Events) and _is_right(events, last, height, width):
+                rows, last = rows + len(events), events.t[-1]
+                yield events
+                continue
+            bad = np.zeros(len(events), bool) if chunk is events else chunk.bad
+            first, error = _first_error(chunk, path, last, height, width, place, rows)
+            bad = bad | _outside(events, height, width)
+            fewest = bad | _out_of_order(events.t, bad, last)
+            count = int(fewest.sum())
+            if strict or dropped + count > MOST_BAD * (rows + len(events)):
+                if first:  # whoever stops before the damage never meets it
+                    yield events.select(slice(first))
+                dropped = 0  # the error says enough
+                raise error
+            first_error = first_error or error
+            rows, dropped = rows + len(events), dropped + count
+            events = events.select(~fewest)
+            if len(events):
+                last = events.t[-1]
+                yield events
+    finally:
+        if dropped:
+            say(f"{first_error}; left out: {dropped:,} of {counted(rows, 'event')}", rows)
+
+
+def _is_right(events: Events, last: int, height: int | None, width: int | None) -> bool:
+    t, x, y = events.t, events.x, events.y
+    steps = np.diff(t)
+    return bool(
+        t[0] >= last
+        and (steps.size == 0 or steps.min() >= 0)
+        and min(x.min(), y.min()) >= 0
+        and (width is None or x.max() < width)
+        and (height is None or y.max() < height)
+    )
+
+
+def _outside(events: Events, height: int | None, width: int | None) -> np.ndarray:
+    outside = (events.x < 0) | (events.y < 0)
+    for column, size in ((events.x, width), (events.y, height)):
+        if size is not None:
+            outside |= column >= size
+    return outside
+
+
+def _out_of_order(t: np.ndarray, bad: np.ndarray, last: int) -> np.ndarray:
+    """(N,) times, which of them do not count -> the fewest to leave out so that the rest is in
+    order, none before `last`: all but a longest non-decreasing subsequence (patience sorting)."""
+    out = ~bad & (t < last)
+    rows = np.flatnonzero(~bad & ~out)[::-1]  # from the end: of two that would do, the first stays
+    times = (-t[rows]).tolist()
+    if not times or bool((np.diff(t[rows]) <= 0).all()):
+        return out
+    tails: list[int] = []  # of the sequences of each length the one that ends earliest: its end
+    places: list[int] = []  # ... and where that is
+    before = [-1] * len(times)
+    for place, time in enumerate(times):
+        length = bisect.bisect_right(tails, time)
+        if length == len(tails):
+            tails.append(time)
+            places.append(place)
+        else:
+            tails[length], places[length] = time, place
+        before[place] = places[length - 1] if length else -1
+    kept, place = [], places[-1]
+    while place >= 0:
+        kept.append(place)
+        place = before[place]
+    out[rows] = True
+    out[rows[kept]] = False
+    return out
+
+
+def _first_error(
+    chunk: "Events | Rows", path: Path, last: int, height, width, place, rows: int
+) -> tuple[int, RecordingError]:
+    """(the first row of a chunk that cannot be, what is to be said of it); rows: before it"""
+    events = chunk if isinstance(chunk, Events) else chunk.events
+    known = np.zeros(len(events), bool) if chunk is events else chunk.bad
+    t, x, y = events.t, events.x, events.y
+    steps = np.diff(t, prepend=last)
+    row = int(np.argmax(known | (steps < 0) | _outside(events, height, width)))
+    if known[row]:
+        return row, chunk.error
+    where = f"{path}, {place(rows + row)}"
+    if steps[row] < 0:
+        return row, RecordingError(
+            f"{where}: time runs backwards, from {t[row] - steps[row]} to {t[row]} us: "
+            "sort the events by time, or --stop before"
+        )
+    name, value = ("y", y[row]) if 0 <= x[row] < (width or np.inf) else ("x", x[row])
+    if value < 0:
+        return row, RecordingError(
+            f"{where}: {name} is {value}, but coordinates are 0 or more: the file is damaged "
+            "or of another format"
+        )
+    return row, RecordingError(
+        f"{where}: {name} is {value}, outside the sensor of {width}x{height} pixels: pass the "
+        "right --sensor-size WIDTHxHEIGHT"
+    )
 
 
 def until_damage(chunks: Iterable[Events]) -> Iterator[Events]:

@@ -79,18 +79,33 @@ def lock_file(file, path: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(folder: Path):
-    """No other run can lock this folder meanwhile. Raises OutputError where one has."""
+def locked(folder: Path, name: Path | None = None):
+    """No other run can lock this folder meanwhile. Raises OutputError where one has.
+
+    name: what the error calls it."""
     try:
         handle = os.open(folder, os.O_RDONLY)
     except PermissionError:  # Windows opens no folders
         yield
         return
     try:
-        lock(handle, folder)
+        lock(handle, name or folder)
         yield
     finally:
         os.close(handle)
+
+
+@contextlib.contextmanager
+def alone_in(folder: Path):
+    """Makes this folder where it is missing; no other run can write into it meanwhile."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"{folder}: cannot make this folder ({error.strerror or error}): choose another output"
+        ) from error
+    with locked(folder):
+        yield
 
 
 def write_text(path: Path, text: str) -> None:

@@ -30,13 +30,15 @@ class Info:
     """Text, zip, HDF5, ECD or EVREAL folder, .bin, .dat, .raw, .aedat4, .es, ROS bag."""
     sensor_size: str | None = None
     """WIDTHxHEIGHT of the sensor, where the recording does not say it."""
+    strict: bool = False
+    """Refuse a recording with a bad row or damage."""
     json: bool = False
     """Print JSON instead of lines."""
 
 
-def describe(path: Path, sensor_size: tuple[int, int] | None = None) -> dict:
+def describe(path: Path, sensor_size: tuple[int, int] | None = None, strict: bool = False) -> dict:
     """Facts of a recording, in the order in which a person wants them."""
-    recording = open_recording(path, sensor_size)
+    recording = open_recording(path, sensor_size, strict)
     counts = np.zeros(recording.pixels, np.int64)
     on = first = last = None
     with tqdm(total=recording.count, unit="ev", unit_scale=True, disable=None) as progress:
@@ -74,7 +76,7 @@ def describe(path: Path, sensor_size: tuple[int, int] | None = None) -> dict:
 
 
 def run(settings: Info) -> None:
-    facts = describe(settings.recording, parse_size(settings.sensor_size))
+    facts = describe(settings.recording, parse_size(settings.sensor_size), settings.strict)
     if settings.json:
         print(json.dumps(facts, indent=2))
         return

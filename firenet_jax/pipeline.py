@@ -48,6 +48,7 @@ from firenet_jax.video import (
     VIDEOS,
     FolderWriter,
     VideoWriter,
+    check_free,
     check_output,
     check_rate,
     followed,
@@ -100,6 +101,9 @@ class Reconstruct:
     """Pictures per second of a video (windows of events have no rate of their own)."""
     sensor_size: str | None = None
     """WIDTHxHEIGHT of the sensor, such as 240x180, where the recording does not say it."""
+    strict: bool = False
+    """Refuse a recording with a bad row or damage, instead of leaving out what cannot be read (at
+    most one event in a thousand) and reading up to the damage."""
     chunk: int | None = None
     """Windows a recording gives the device at once (default: 16; on a CPU 8 of a sensor of up to
     65,536 pixels, 4 of larger ones)."""
@@ -144,10 +148,9 @@ class Running:
     job: Job
     windows: Iterator[Window]
     ahead: Window | None  # the next window; None after the last
-    done: int  # pictures of an earlier run, already on disk
-    reached: int  # windows taken so far, those of the earlier run among them
+    reached: int  # windows taken so far, those of an earlier run among them
+    writer: FolderWriter | VideoWriter
     error: RecordingError | None = None  # that ended its windows before their time
-    writer: FolderWriter | VideoWriter | None = None  # opened with the first picture
 
     def take(self, count: int) -> list[Window]:
         """The next `count` windows, or as many as there are."""
@@ -194,12 +197,13 @@ def run(settings: Reconstruct) -> list[Path]:
     if not outputs:
         return []
     for output in outputs:  # before recordings are opened: some are read whole for their size
+        check_free(output)
         if not done_file(output).is_file():
             check_output(output, settings.overwrite)
     size = parse_size(settings.sensor_size)
     jobs = []
     for path, output in zip(settings.recordings[mine], outputs, strict=True):
-        recording = open_recording(path, size)
+        recording = open_recording(path, size, settings.strict)
         job = Job(recording, output, describe(settings, recording, weights))
         if is_done(job):
             logger.warning("%s: done by the run that this one continues", output)
@@ -304,7 +308,8 @@ def reconstruct_jobs(
     mesh = in_a_row(jax.local_devices()[:count]) if count > 1 else None
     slots = -(-wanted // count) * count  # the same number on each device; some may stay empty
     weights = jax.device_put(weights, shared(EVERYWHERE, mesh) if mesh else None)
-    chunks = ahead(in_chunks(jobs, settings, slots, count, failed), depth=1)
+    writers: dict[Path, FolderWriter | VideoWriter] = {}  # of jobs that are not done
+    chunks = ahead(in_chunks(jobs, settings, slots, count, failed, writers), depth=1)
 
     def device():
         """Chunk by chunk: (chunk, pictures on the host).
@@ -348,21 +353,17 @@ def reconstruct_jobs(
         return chunk, jax.device_get(shown)
 
     pictures_done = events_done = 0
-    open_jobs: dict[int, Running] = {}
     finished = ahead(device(), depth=1)
     try:
         for chunk, shown in finished:
             for slot, part in chunk.parts.items():
                 running, times = part.running, part.times
-                if running.writer is None:
-                    running.writer = open_writer(running.job.output, settings.fps, running.done)
-                    open_jobs[slot] = running
                 for picture, time_of in zip(shown[:, slot], times, strict=False):
                     running.writer.write(picture, time_of)
                 pictures_done += len(times)
                 if part.ends and running.error:
                     failed[running.job.output] = running.error
-                    open_jobs.pop(slot).writer.abandon()
+                    writers.pop(running.job.output).abandon()
                 elif part.ends:
                     output = running.job.output
                     done_file(output).unlink(missing_ok=True)
@@ -371,7 +372,7 @@ def reconstruct_jobs(
                         (output / "resume.npz").unlink(missing_ok=True)
                     if len(settings.recordings) > 1:
                         write_text(done_file(output), done_as(running.job))
-                    del open_jobs[slot]
+                    del writers[output]
                 else:
                     publish_position(part)
             events_done += chunk.count
@@ -380,8 +381,8 @@ def reconstruct_jobs(
     finally:
         finished.close()
         chunks.close()  # else its thread would live as long as an exception that holds this frame
-        for running in open_jobs.values():
-            running.writer.abandon()
+        for writer in writers.values():
+            writer.abandon()
     return pictures_done, events_done
 
 
@@ -409,8 +410,12 @@ def in_chunks(
     slots: int,
     devices: int,
     failed: dict[Path, RecordingError],
+    writers: dict[Path, FolderWriter | VideoWriter],
 ) -> Iterator[Chunk]:
-    """Jobs -> chunks of T x B windows, B the slots; a free slot takes the next job."""
+    """Jobs -> chunks of T x B windows, B the slots; a free slot takes the next job.
+
+    writers: where those that were opened go, by their output.
+    """
     steps = settings.chunk or chunk_for(jobs[0].recording.pixels)
     waiting = iter(jobs)
     running: dict[int, Running] = {}
@@ -420,7 +425,7 @@ def in_chunks(
         for slot in range(slots):
             while slot not in running and (job := next(waiting, None)) is not None:
                 try:
-                    running[slot], starts[slot] = start(job, settings)
+                    running[slot], starts[slot] = start(job, settings, writers)
                 except RecordingError as error:
                     failed[job.output] = error
         if not running:
@@ -443,22 +448,32 @@ def in_chunks(
         yield Chunk(events, count, valid, parts, starts)
 
 
-def start(job: Job, settings: Reconstruct) -> tuple[Running, Session]:
+def start(
+    job: Job, settings: Reconstruct, writers: dict[Path, FolderWriter | VideoWriter]
+) -> tuple[Running, Session]:
     """Opens the stream of a job's windows, after those that an interrupted run has finished."""
-    recording = job.recording
-    chunks = recording.events()
-    if settings.start is not None or settings.stop is not None:
-        chunks = filters.between(chunks, settings.start, settings.stop)
-    if settings.hot_pixels is not None:
-        chunks = filters.without(chunks, hot_pixels(settings.hot_pixels, recording))
-    if settings.flip:
-        chunks = filters.turned(chunks, recording.height, recording.width)
-    windows = cut(recording, settings.windows, chunks)
-    done, session = load_position(job, settings)
-    first = next(itertools.islice(windows, done, None), None)
-    if first is None and not done:
-        raise RecordingError(f"{recording.path}: no events, or none that the filters let pass")
-    return Running(job, windows, first, done, done), session
+    # First of all, as it keeps other runs from what is read and removed here.
+    writer = writers[job.output] = open_writer(job.output, settings.fps)
+    try:
+        recording = job.recording
+        chunks = recording.events()
+        if settings.start is not None or settings.stop is not None:
+            chunks = filters.between(chunks, settings.start, settings.stop)
+        if settings.hot_pixels is not None:
+            chunks = filters.without(chunks, hot_pixels(settings.hot_pixels, recording))
+        if settings.flip:
+            chunks = filters.turned(chunks, recording.height, recording.width)
+        windows = cut(recording, settings.windows, chunks)
+        done, session = load_position(job, settings)
+        first = next(itertools.islice(windows, done, None), None)
+        if first is None and not done:
+            raise RecordingError(f"{recording.path}: no events, or none that the filters let pass")
+    except RecordingError:
+        writers.pop(job.output).abandon()
+        raise
+    if done:
+        writer.keep(done)
+    return Running(job, windows, first, done, writer), session
 
 
 def hot_pixels(choice: str, recording: Recording) -> np.ndarray:

@@ -26,6 +26,8 @@ import dataclasses
 import itertools
 import json
 import math
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -116,7 +118,7 @@ class Train:
     procedural: float = 0.25
     """Part of the textures that is drawn instead."""
     steps: int = 20_000
-    """Updates of the parameters."""
+    """Updates of the parameters. A run that is done goes on when it is given more."""
     batch: int = 2
     """Sequences in a step."""
     crop: int = 96
@@ -139,7 +141,8 @@ class Train:
     learning_rate: float = 1e-3
     """Greatest rate, after warming up; it then falls to a hundredth along a cosine."""
     warmup: int = 200
-    """Steps in which the rate rises from zero."""
+    """Steps in which the rate rises from zero; fewer in a run so short that they would be more than
+    a fifth of it."""
     optimiser: Literal["muon", "adam"] = "muon"
     """muon learns more from a step (experiments/compare_optimisers.py); adam is the paper's. A
     rate means the same for both: the size of an update."""
@@ -203,9 +206,15 @@ class Train:
             raise ValueError(f"save_every is {self.save_every} seconds, but must be 0 or more")
         if not 0 <= self.procedural <= 1:
             raise ValueError(f"procedural is {self.procedural}, but is a part of the textures, 0-1")
-        if not 0 <= self.warmup < self.steps:
+        if not 0 <= warming_up(self) < self.steps:
             raise ValueError(f"warmup is {self.warmup} steps of {self.steps}: use 0 or more, fewer")
         check_processes(self.coordinator, self.processes, self.process)
+
+
+def warming_up(settings: Train) -> int:
+    """Steps: what was asked for, or at most a fifth of a run where nothing was."""
+    asked = settings.warmup != Train.warmup
+    return settings.warmup if asked else min(settings.warmup, settings.steps // 5)
 
 
 class TrainState(NamedTuple):
@@ -225,7 +234,11 @@ def optimiser(settings: Train) -> optax.GradientTransformation:
     Biases and the 1x1 convolution are Adam's in both cases.
     """
     rate = optax.warmup_cosine_decay_schedule(
-        0.0, settings.learning_rate, settings.warmup, settings.steps, settings.learning_rate / 100
+        0.0,
+        settings.learning_rate,
+        warming_up(settings),
+        settings.steps,
+        settings.learning_rate / 100,
     )
     update = optax.adam(rate)
     if settings.optimiser == "muon":
@@ -488,8 +501,11 @@ def run(settings: Train, stop: int | None = None) -> None:
         log = Log(folder, done)
         best, last_save = log.best(), time.monotonic()
         last = min(settings.steps, stop or settings.steps)
-        with tqdm(total=last, initial=done, unit="step", disable=_bar()) as progress:
-            while done < last:
+        with (
+            tqdm(total=last, initial=done, unit="step", disable=_bar()) as progress,
+            _interruptible() as interrupted,
+        ):
+            while done < last and not interrupted:
                 state, terms = train_step(state, next(sources), settings)
                 done += 1
                 progress.update()
@@ -511,9 +527,35 @@ def run(settings: Train, stop: int | None = None) -> None:
                 if done == last or (logged and _due(last_save, settings)):
                     saved.save(done, args=ocp.args.StandardSave(state))
                     last_save = time.monotonic()
+        if interrupted and saved.latest_step() != done:
+            saved.save(done, args=ocp.args.StandardSave(state))
         log.close()
+    if interrupted:
+        raise KeyboardInterrupt(f"step {done} is saved: the same command goes on from there")
     if _first():
         print(f"{folder / 'weights.npz'}: best validation loss {best:.4f} in {done} steps")
+
+
+@contextlib.contextmanager
+def _interruptible():
+    """A list that Ctrl-C, pressed once, puts something in; pressed again, it interrupts at once.
+
+    So a step is never left half done. Several processes would not save at the same step: there, and
+    where this is no main thread, it interrupts at once."""
+    pressed: list[int] = []
+    if jax.process_count() > 1 or threading.current_thread() is not threading.main_thread():
+        yield pressed
+        return
+
+    def once(number, frame):
+        pressed.append(number)
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.signal(signal.SIGINT, once)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _due(last_save: float, settings: Train) -> bool:
@@ -621,8 +663,8 @@ class Log:
 
     def best(self) -> float:
         """The least validation loss so far."""
-        losses = [entry["loss"] for entry in self.entries if entry["kind"] == "validation"]
-        return min(losses, default=float("inf"))
+        losses = [entry["loss"] for entry in self.entries if entry.get("kind") == "validation"]
+        return min(filter(math.isfinite, losses), default=math.inf)
 
     def close(self) -> None:
         if self.board is not None:
@@ -630,10 +672,15 @@ class Log:
 
 
 def _entries(path: Path) -> Iterator[dict]:
-    """Lines of a log, but what was half written when a run was killed."""
-    for line in path.read_text().splitlines() if path.exists() else []:
-        with contextlib.suppress(json.JSONDecodeError):
-            yield json.loads(line)
+    """Lines of a log, but what was half written when a run was killed, and what is no entry."""
+    for line in path.read_bytes().splitlines() if path.exists() else []:
+        with contextlib.suppress(ValueError, TypeError, RecursionError, OverflowError):
+            entry = json.loads(line)
+            if not (isinstance(entry, dict) and type(entry.get("step")) is int):
+                continue
+            if entry.get("kind") == "validation":
+                entry["loss"] = float(entry.get("loss", "nothing"))
+            yield entry
 
 
 def _check_finite(terms: dict[str, float], state: TrainState, folder: Path) -> None:
@@ -672,7 +719,15 @@ def _check_settings(folder: Path, settings: Train) -> None:
         found = _filled(json.loads(path.read_text()), json.loads(_as_text(Train(folder))))
     except (ValueError, AttributeError) as error:
         raise ValueError(f"{path} is damaged ({error}): choose another --output") from error
-    if other := differences(found, json.loads(_as_text(settings)), but=FREE):
+    now = json.loads(_as_text(settings))
+    if found["steps"] < settings.steps and not differences(found, now, but=(*FREE, "steps")):
+        if (folder / "checkpoints" / str(found["steps"])).is_dir():
+            logger.warning(
+                "%s: its %d steps are done: it goes on to %d, with the rate of a run so long",
+                folder, found["steps"], settings.steps,
+            )  # fmt: skip
+            return
+    if other := differences(found, now, but=FREE):
         raise ValueError(
             f"{folder} holds a run with other settings ({', '.join(other)}): choose another "
             "--output, or go on with the same settings"

@@ -18,7 +18,7 @@ import av
 import numpy as np
 from PIL import Image
 
-from firenet_jax.files import OutputError, lock_file, partial_name, writing
+from firenet_jax.files import OutputError, lock_file, locked, partial_name, writing
 
 VIDEOS = (".mp4", ".gif")
 # What is no folder's name: a dot alone, as in out_0.35, does not make a file of it.
@@ -103,25 +103,40 @@ def _strange(folder: Path) -> str | None:
     return min((name for name in names if not OURS.fullmatch(name)), default=None)
 
 
+def check_free(path: Path) -> None:
+    """Raises OutputError where another run is writing this output."""
+    if partial_name(path).exists():
+        with locked(partial_name(path), path):
+            pass
+
+
 class FolderWriter:
     """Pictures -> `frame_%010d.png` and `timestamps.txt`, which can go on where it stopped.
 
-    timestamps.txt holds one line a picture: the time of its last event in seconds.
+    timestamps.txt holds one line a picture: the time of its last event in seconds. From the
+    beginning to the end no other run can write into the folder.
     """
 
-    def __init__(self, path: Path, done: int = 0):
-        """done: pictures of an earlier run to keep; what lies beyond them is written again."""
+    def __init__(self, path: Path):
         self.path, self.partial = path, partial_name(path)
-        self.count = done
+        self.count, self.stamps = 0, None
+        self.holding = contextlib.ExitStack()
         with writing(path):
             self.partial.mkdir(exist_ok=True)
+            self.holding.enter_context(locked(self.partial, path))
+
+    def keep(self, done: int) -> None:
+        """Goes on after so many pictures of an earlier run; what lies beyond is written again."""
+        self.count = done
+        with writing(self.path):
             self.stamps = (self.partial / "timestamps.txt").open("a+", newline="")
-            lock_file(self.stamps, path)
             self.stamps.seek(0)
             kept = itertools.islice(self.stamps, done)
             self.stamps.truncate(sum(map(len, kept)))
 
     def write(self, picture: np.ndarray, time: int) -> None:
+        if self.stamps is None:
+            self.keep(0)
         name = self.partial / f"frame_{self.count:010d}.png"
         with writing(self.path):
             Image.fromarray(picture).save(name, compress_level=PNG_LEVEL)
@@ -143,14 +158,25 @@ class FolderWriter:
             if self.path.exists() and any(self.path.iterdir()):
                 old = Path(tempfile.mkdtemp(prefix=f"{self.path.name}.old.", dir=self.path.parent))
                 self.path.rename(old / self.path.name)
+            if os.name == "nt":  # an open folder cannot be renamed there, and has no lock
+                self.holding.close()
             self.partial.rename(self.path)
+            self.holding.close()
         if old:
             shutil.rmtree(old, ignore_errors=True)
 
     def abandon(self) -> None:
-        """Stops writing; the partial folder stays, for the next run to go on."""
+        """Stops writing; a partial folder with pictures stays, for the next run to go on."""
+        if self.stamps is not None:
+            with contextlib.suppress(OSError):
+                self.stamps.close()
+        left = {entry.name: entry for entry in self.partial.glob("*")}
         with contextlib.suppress(OSError):
-            self.stamps.close()
+            if not left.keys() - {"timestamps.txt"}:
+                for stamps in left.values():
+                    stamps.unlink()
+                self.partial.rmdir()
+        self.holding.close()
 
 
 class VideoWriter:
@@ -201,15 +227,19 @@ class VideoWriter:
             if self.stream is not None:
                 self.container.mux(self.stream.encode(None))
             self.container.close()
-            self.held.close()
+            if os.name == "nt":  # an open file cannot be renamed there, and has no lock
+                self.held.close()
             self.partial.replace(self.path)
+            self.held.close()
 
     def abandon(self) -> None:
         """Removes the partial file: a video cannot be continued."""
         with contextlib.suppress(OSError):
             self.container.close()
-        self.held.close()
+        if os.name == "nt":
+            self.held.close()
         self.partial.unlink(missing_ok=True)
+        self.held.close()
 
 
 def _palette_filter(height: int, width: int, rate: Fraction) -> av.filter.Graph:
@@ -229,13 +259,10 @@ def _palette_filter(height: int, width: int, rate: Fraction) -> av.filter.Graph:
     return graph
 
 
-def open_writer(path: Path, fps: float, done: int = 0) -> FolderWriter | VideoWriter:
-    """done: pictures of an interrupted run to keep; only a folder can have them.
-
-    Raises OutputError for a rate that the output cannot show.
-    """
+def open_writer(path: Path, fps: float) -> FolderWriter | VideoWriter:
+    """Raises OutputError for a rate that the output cannot show, or where another run writes it."""
     check_rate(path, fps)
-    return VideoWriter(path, fps) if path.suffix in VIDEOS else FolderWriter(path, done)
+    return VideoWriter(path, fps) if path.suffix in VIDEOS else FolderWriter(path)
 
 
 def write_video(path: str | Path, pictures: Iterable[np.ndarray], fps: float = 30) -> None:

@@ -125,7 +125,7 @@ def make_bad_inputs(folder):
             file[f"events/{name}"] = np.arange(5000).astype(dtype) % 20
         file.attrs["sensor_resolution"] = [20, 24]
     truncated(folder / "cut.h5", (folder / "whole.h5").read_bytes())
-    (folder / "cut.bin").write_bytes(b"1234567")
+    (folder / "cut.bin").write_bytes(b"1234")  # not even one event
     return {
         "missing.txt": "no such file", "empty.txt": "empty", "five.txt": "line 4",
         "nan.txt": "line 4", "backwards.txt": "line 4", "negative.txt": "line 4",

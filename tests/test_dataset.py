@@ -285,7 +285,7 @@ def test_one_in_twenty_is_for_validation(tmp_path, monkeypatch):
 def test_a_disk_without_room_is_said_before_it_is_full(tmp_path, monkeypatch):
     usage = dataset.shutil.disk_usage(tmp_path)
     monkeypatch.setattr(dataset.shutil, "disk_usage", lambda _: usage._replace(free=1000))
-    with pytest.raises(OutputError, match="needs about .* GB .*make room or ask for fewer"):
+    with pytest.raises(OutputError, match="needs about .* MB .*make room or ask for fewer"):
         run(settings(tmp_path / "set"))
 
 
@@ -381,7 +381,7 @@ def bad_lines(folder):
         ("-o taken", "is not empty"),
         ("-o file", "choose another name"),
         ("-o a.h5", "go into a folder"),
-        ("-o file/set", "cannot write there"),
+        ("-o file/set", "cannot make this folder"),
         ("-o damaged", "is damaged"),
         ("-o other", "scene.speed was [20.0, 100.0], now [3.0, 1000.0], seconds was 0.2, now 2.0"),
         ("-o out --video clip.mp4", "out.h5"),

@@ -16,7 +16,7 @@ from processes import finish, start
 from firenet_jax import pipeline
 from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.events import RecordingError
-from firenet_jax.files import OutputError, read_arrays
+from firenet_jax.files import OutputError, locked, read_arrays
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pictures import Display
 from firenet_jax.pipeline import Reconstruct, describe, plan, run
@@ -530,3 +530,27 @@ def test_colours_of_a_recording_that_ends_beside_one_that_goes_on(tmp_path, weig
         run(settings(weights, (path,), tmp_path / "alone" / path.stem, **choices))
         together, alone = (pictures_of(tmp_path / n / path.stem)[0] for n in ("all", "alone"))
         assert np.abs(together.astype(int) - alone).max() <= 3
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
+@pytest.mark.parametrize("seen", [True, False], ids=["already writing", "begins meanwhile"])
+@pytest.mark.parametrize("choice", [{}, {"overwrite": True, "windows": Windows(events=90)}])
+def test_a_second_run_into_a_folder_touches_nothing(tmp_path, weights, monkeypatch, seen, choice):
+    recording, out = write_recording(tmp_path / "a.txt"), tmp_path / "out"
+    unfinished(weights, recording, out, monkeypatch)
+    partial = tmp_path / "out.partial"
+    (partial / "resume.12.npz").write_bytes(b"of the first run, not published yet")
+    before = {path.name: path.read_bytes() for path in partial.iterdir()}
+    if not seen:  # the second asks for the lock later, in another place
+        monkeypatch.setattr(pipeline, "check_free", lambda path: None)
+    for output in (out, tmp_path / "out.mp4"):
+        if output.suffix:
+            (tmp_path / "out.partial.mp4").write_bytes(b"half")
+            partial = tmp_path / "out.partial.mp4"
+        with locked(partial), pytest.raises(OutputError, match=f"{output}: another run is writing"):
+            run(settings(weights, (recording,), output, **choice))
+    partial = tmp_path / "out.partial"
+    assert before == {path.name: path.read_bytes() for path in partial.iterdir()}
+    assert (tmp_path / "out.partial.mp4").read_bytes() == b"half"
+    run(settings(weights, (recording,), out))
+    assert len(list(out.glob("*.png"))) == 30 and not partial.exists()

@@ -8,11 +8,11 @@ import contextlib
 import gzip
 import importlib.util
 import io
+import itertools
 import struct
 import sys
 import zipfile
 from pathlib import Path
-from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -20,9 +20,9 @@ import pytest
 from PIL import Image
 
 from firenet_jax import readers
-from firenet_jax.events import Events, RecordingError, concatenate
+from firenet_jax.events import Events, RecordingError, _out_of_order, checked, concatenate
 from firenet_jax.readers import (
-    camera,
+    aedat4,
     dat,
     ecd,
     evt3,
@@ -42,8 +42,8 @@ ROWS = [f"{t / 1e6:.6f} {x} {y} {p}" for t, x, y, p in EVENTS]
 FRAME = np.arange(12, dtype=np.uint8).reshape(3, 4) * 20
 
 
-def events_of(path, size=(240, 320)) -> Events:
-    return concatenate([Events.empty(), *open_recording(path, size).events()])
+def events_of(path, size=(240, 320), strict=False) -> Events:
+    return concatenate([Events.empty(), *open_recording(path, size, strict).events()])
 
 
 def check(path, t=T, x=X, y=Y, p=P, size=(240, 320)):
@@ -57,7 +57,7 @@ def check(path, t=T, x=X, y=Y, p=P, size=(240, 320)):
 def refused(path, *said, size=(240, 320)):
     """Reading raises RecordingError, in one sentence that names the file and says all of this."""
     with pytest.raises(RecordingError) as error:
-        events_of(path, size)
+        events_of(path, size, strict=True)
     message = str(error.value)
     assert str(path) in message and "\n" not in message
     for words in said:
@@ -124,7 +124,7 @@ def test_numbers_that_events_cannot_hold():
         columns = [*good]
         columns[column] = np.asarray(value)
         with pytest.raises(RecordingError) as error:
-            readers.to_events(Path("file"), 10, *columns)
+            list(checked([readers.to_events(Path("file"), 10, *columns)], Path("file"), None, None))
         assert said in str(error.value)
 
 
@@ -155,7 +155,7 @@ def test_frames_of_other_kinds():
 
 
 @pytest.mark.parametrize(
-    "name, package", [("a.raw", "faery"), ("a.aedat4", "faery"), ("a.bag", "rosbags")]
+    "name, package", [("a.raw", "faery"), ("a.es", "faery"), ("a.bag", "rosbags")]
 )
 def test_missing_extra(tmp_path, monkeypatch, name, package):
     without(monkeypatch, package)
@@ -322,7 +322,7 @@ def test_what_comes_before_damaged_compression_is_read(tmp_path, rows, damage):
     # Changed bytes may still be unpacked, to other text.
     said = "a.txt.gz: cannot be read" if damage == "cut" else "a.txt.gz"
     with pytest.raises(RecordingError, match=said):
-        for events in open_recording(path).events():
+        for events in open_recording(path, strict=True).events():
             times += events.t.tolist()
     assert times == list(range(len(times)))
     assert len(times) > 0.4 * rows
@@ -863,19 +863,10 @@ def test_es_and_aedat4(tmp_path):
         assert (recording.format, recording.frames) == (kind, None)
         refused(write(tmp_path / f"other{path.suffix}", b"hello" * 9), "cannot be read")
     content = path.read_bytes()
-    refused(write(tmp_path / "cut.aedat4", content[:-20]), "cannot be read")
+    behind = aedat4._layout(path).end  # the table there is not read
+    refused(write(tmp_path / "cut.aedat4", content[: behind - 3]), "cannot be read")
     path = write(tmp_path / "xml.aedat4", content.replace(b"outInfo", b"out\xffnfo"))
-    refused(path, "header is damaged")  # faery alone would end the process
-
-
-def test_frames_of_one_camera_are_not_mixed_with_those_of_another():
-    kinds = {0: "events", 1: "frame", 2: "frame"}
-    packets = [
-        (SimpleNamespace(id=track, data_type=kinds[track]), name)
-        for track, name in ((0, "events"), (1, "a"), (2, "other"), (1, "b"))
-    ]
-    faery = SimpleNamespace(aedat=SimpleNamespace(Decoder=lambda path: iter(packets)))
-    assert list(camera._pictures(faery, Path("a.aedat4"))) == ["a", "b"]
+    refused(path, "header is damaged")
 
 
 # ---------------------------------------------------------------- ROS bags
@@ -1075,6 +1066,9 @@ def test_wrong_bags(new_bag, tmp_path):
     bag.close()
     refused(path, "event 2: time runs backwards")
     if path.is_file():
+        path, bag = new_bag("d")
+        bag.events("/dvs/events", EPOCH, T[:2] + EPOCH, X[:2], Y[:2], P[:2])
+        bag.close()
         refused(write(tmp_path / "cut.bag", path.read_bytes()[:-200]), "cannot be read")
         refused(write(tmp_path / "text.bag", "hello"), "cannot be read")
     else:
@@ -1093,8 +1087,8 @@ SAMPLES = {
     "e2vid_slider_depth.zip": (None, (180, 240), True, 50_000, 3811, 0.170345, 239, 179),
     "ncaltech101_faces_easy_0001.bin": (None, (173, 151), False, 67_445, 6, 0.299358, 150, 172),
     "ncars.dat": (None, (42, 78), False, 2_009, 0, 0.099952, 77, 41),
-    "dvxplorer_face.aedat4": ("faery", (240, 320), True, 111_954, None, 0.589917, 319, 239),
-    "davis346_frames.aedat4": ("faery", (260, 346), True, 117_667, None, 0.129999, 345, 259),
+    "dvxplorer_face.aedat4": (None, (240, 320), True, 111_954, None, 0.589917, 319, 239),
+    "davis346_frames.aedat4": (None, (260, 346), True, 117_667, None, 0.129999, 345, 259),
     "evt2_sparklers.raw": ("faery", (480, 640), False, 521_252, None, 0.095871, 639, 479),
     "evt3_driving.raw": ("faery", (720, 1280), False, 219_596, 11_718_656, 0.008811, 1279, 719),
     "dvs_synthetic_sweep.es": ("faery", (240, 320), True, 473_225, 0, 0.999, 319, 239),
@@ -1125,7 +1119,6 @@ def test_sample_frames(recordings):
     frames = open_recording(recordings / "ecd_slider_depth").frames
     np.testing.assert_array_equal(frames.times, [0, 38_766, 77_531, 116_296, 155_062])
     assert frames.read(4).shape == (180, 240) and frames.read(4).std() > 30
-    pytest.importorskip("faery")
     recording = open_recording(recordings / "davis346_frames.aedat4")
     frames = recording.frames
     np.testing.assert_array_equal(np.diff(frames.times), [40_000, 40_000])
@@ -1176,3 +1169,105 @@ def test_damaged_samples(recordings, tmp_path):
         content = (recordings / name).read_bytes()
         path = write(tmp_path / name, content[: len(content) // 2])
         refused(path, "cannot be read", size=(480, 640))
+
+
+CUT = ["davis346_frames.aedat4", "evt2_sparklers.raw", "evt3_driving.raw", "dvs_synthetic_sweep.es",
+       "ncars.dat", "ncaltech101_faces_easy_0001.bin", "ros1_event_camera_msgs.bag"]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CUT)
+def test_half_a_sample_gives_half_of_its_events(recordings, tmp_path, caplog, name):
+    """Half of the bytes, and one that is no whole event; faery alone reads half an .es file."""
+    whole = events_of(recordings / name, (720, 1280))
+    content = (recordings / name).read_bytes()
+    recording = open_recording(
+        write(tmp_path / name, content[: len(content) // 2 | 1]), (720, 1280)
+    )
+    for _ in range(2):
+        events = concatenate(list(recording.events()))
+    assert 0.1 * len(whole) < len(events) < 0.9 * len(whole)
+    for column in "txyp":
+        np.testing.assert_array_equal(
+            getattr(events, column), getattr(whole, column)[: len(events)]
+        )
+    if name.endswith(".es"):
+        return  # the file does not say how long it is
+    assert caplog.text.count(f"what comes before is read: {len(events):,} events") == 1
+    refused(recording.path, "cut off" if "bag" not in name else "ends early", size=(720, 1280))
+
+
+@pytest.mark.parametrize("name", ["davis346_59_frames", "davis346_frames", "dvxplorer_face"])
+def test_aedat4_against_faery(recordings, name):
+    faery = pytest.importorskip("faery")
+    path = recordings / f"{name}.aedat4"
+    ours, packets, frames = events_of(path, None), [], []
+    for track, packet in faery.aedat.Decoder(path):
+        if track.data_type == "events":
+            packets.append(packet)
+        elif track.data_type == "frame":
+            frames.append(packet)
+    theirs = np.concatenate(packets)
+    for column, other in (("t", "t"), ("x", "x"), ("y", "y"), ("p", "on")):
+        np.testing.assert_array_equal(getattr(ours, column), theirs[other])
+    found = open_recording(path).frames
+    assert (found is None) == (not frames)
+    for i, frame in enumerate(frames):
+        assert found.times[i] == frame.t
+        np.testing.assert_array_equal(found.read(i), frame.pixels)
+
+
+# ---------------------------------------------------------------- single bad rows
+
+
+def test_single_bad_rows_are_left_out_and_said_once(tmp_path, caplog):
+    """Each kind of them, in a file of 20,000; what is left is the rest, as a loop finds it."""
+    rows = [f"{i * 1e-5:.6f} {i % 320} {i % 240} {i % 2}" for i in range(20_000)]
+    wrong = {5: "0.00003 1 1 1", 70: "0.0007 320 1 1", 900: "0.009 -1 1 1", 1000: "words", 6000: "",
+             1200: "0.012 1 1 7", 1300: "nan 1 1 1", 1400: "0.014 1 1.5 1", 1500: "9e9 1 1 1",
+             1600: "0.016 1 1", 1700: "0.017 1 1 1 1", 1800: "1e300 1 1 1"}  # fmt: skip
+    for row, line in wrong.items():
+        rows[row] = line
+    path = write(tmp_path / "events.txt", "320 240\n" + "\n".join(rows) + "\n")
+    good = [row.split() for i, row in enumerate(rows) if i not in wrong]
+    for _ in range(2):
+        events = events_of(path, None)
+        np.testing.assert_array_equal(events.t, [round(1e6 * float(t)) for t, *_ in good])
+        np.testing.assert_array_equal(events.x, [int(x) for _, x, *_ in good])
+    caplog.clear()
+    recording = open_recording(path)
+    for _ in range(3):
+        list(recording.events())
+    assert len(caplog.records) == 1
+    assert "events.txt, line 7: time runs backwards, from 40 to 30 us" in caplog.text
+    assert "left out: 11 of 19,999 events (--strict refuses that)" in caplog.text  # one is empty
+    refused(path, "line 7: time runs backwards", size=None)
+
+
+def test_as_few_as_possible_are_left_out_for_the_order_of_time():
+    """The number against all subsets of ten times."""
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        t, last = rng.integers(0, 12, 10), int(rng.integers(0, 4))
+        bad = rng.random(10) < 0.1
+        out = _out_of_order(t, bad, last)
+        kept = t[~out & ~bad]
+        assert (np.diff(kept) >= 0).all() and (kept >= last).all()
+        most = max(
+            len(chosen)
+            for mask in itertools.product([False, True], repeat=10)
+            if (np.diff(chosen := t[np.array(mask) & ~bad]) >= 0).all() and (chosen >= last).all()
+        )
+        assert len(kept) == most
+    spike = np.arange(1000)
+    spike[500] = 10**9  # leaving out what follows it would be wrong
+    assert np.flatnonzero(_out_of_order(spike, np.zeros(1000, bool), 0)).tolist() == [500]
+
+
+def test_more_than_one_in_a_thousand_is_an_error_wherever_it_comes(tmp_path):
+    def recording(*wrong):
+        rows = [f"{i * 1e-6:.6f} {400 if i in wrong else 1} 1 1" for i in range(3000)]
+        return write(tmp_path / "events.txt", "320 240\n" + "\n".join(rows) + "\n")
+
+    assert len(events_of(recording(0, 1500, 2999), None)) == 2997
+    with pytest.raises(RecordingError, match="line 2: x is 400, outside the sensor of 320x240"):
+        events_of(recording(0, 1500, 2998, 2999), None)

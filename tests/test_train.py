@@ -281,6 +281,60 @@ def test_a_log_whose_last_line_is_half_written_goes_on(tmp_path):
     assert [entry["step"] for entry in entries(tmp_path)] == [1, 6]
 
 
+def test_a_damaged_log_keeps_what_is_whole(tmp_path):
+    log = Log(tmp_path, 0)
+    for step in (1, 2):
+        log.write(step, "validation", {"loss": jnp.float32(10 - step)})
+    first, second = (tmp_path / "log.jsonl").read_bytes().splitlines()
+    wrong = [
+        b'{"step": \xff\xfe}', b'{"kind": "validation", "loss": 1}', b"[]", b"7", b"null", b"",
+        b'{"step": ' + b"9" * 10**6 + b"}", b"[" * 10**5, b'{"step": "2"}', b'{"step": true}',
+        b'{"step": 1, "kind": "validation"}', b'{"step": 1, "kind": "validation", "loss": "x"}',
+        b'{"step": 1, "kind": "validation", "loss": {}}',
+        b'{"step": 1, "kind": "validation", "loss": 1' + b"0" * 400 + b"}",
+    ]  # fmt: skip
+    (tmp_path / "log.jsonl").write_bytes(b"\n".join([first, *wrong, second]))
+    log = Log(tmp_path, 5)
+    assert [entry["step"] for entry in log.entries] == [1, 2] and log.best() == 8
+    (tmp_path / "log.jsonl").write_text(
+        '{"step": 1, "kind": "validation", "loss": NaN}\n{"step": 2}\n'
+    )
+    assert Log(tmp_path, 5).best() == float("inf")
+
+
+def test_a_short_run_warms_up_in_fewer_steps(tmp_path):
+    assert train.warming_up(Train(tmp_path, steps=30)) == 6
+    assert train.warming_up(Train(tmp_path)) == 200
+    assert train.warming_up(Train(tmp_path, steps=1)) == 0
+    assert train.warming_up(Train(tmp_path, steps=30, warmup=20)) == 20
+
+
+@pytest.mark.slow
+def test_a_finished_run_is_lengthened_and_ctrl_c_saves(tmp_path, monkeypatch, caplog):
+    run(tiny(tmp_path, steps=2))
+    with pytest.raises(ValueError, match="steps was 2, now 1"):
+        run(tiny(tmp_path, steps=1, warmup=0))
+    original = train.train_step
+
+    def pressed(state, *args):
+        if int(state.step) == 3:
+            signal.raise_signal(signal.SIGINT)
+        return original(state, *args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "train_step", pressed)
+        with pytest.raises(KeyboardInterrupt, match="step 4 is saved: the same command goes on"):
+            run(tiny(tmp_path, steps=6, save_every=1e6))
+    assert "its 2 steps are done: it goes on to 6" in caplog.text
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    with pytest.raises(ValueError, match="steps was 6, now 8"):  # not done: of another schedule
+        run(tiny(tmp_path, steps=8))
+    run(tiny(tmp_path, steps=6))
+    assert "going on after step 4" in caplog.text
+    steps = [step for step, kind, _ in losses(tmp_path) if kind == "train"]
+    assert steps == [1, 2, 3, 4, 5, 6]
+
+
 def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypatch):
     Log(tmp_path, 0).write(1, "validation", {"loss": jnp.float32(3)})
 

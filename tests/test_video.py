@@ -41,7 +41,8 @@ def test_folder_goes_on_where_it_stopped(tmp_path):
     for k in range(5):  # two more than will be kept
         writer.write(pictures[k], k)
     writer.abandon()
-    writer = FolderWriter(tmp_path / "out", done=3)
+    writer = FolderWriter(tmp_path / "out")
+    writer.keep(3)
     writer.write(pictures[3], 3)
     writer.finish()
     assert len(list((tmp_path / "out").glob("*.png"))) == 4

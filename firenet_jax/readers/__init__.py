@@ -27,6 +27,7 @@ from firenet_jax.events import (
     Frames,
     Recording,
     RecordingError,
+    Rows,
     checked,
     concatenate,
     event_number,
@@ -35,7 +36,7 @@ from firenet_jax.events import (
 )
 
 # In the order in which they are asked.
-FORMATS = ("ecd", "npy", "rosbag", "hdf5", "text", "ncaltech", "dat", "camera")
+FORMATS = ("ecd", "npy", "rosbag", "hdf5", "text", "ncaltech", "dat", "aedat4", "camera")
 
 CHUNK = 1 << 18  # events a reader yields at once: 3 MB as Events
 
@@ -45,20 +46,24 @@ class Source:
     """What a format module reads out of a file; `open_recording` turns it into a Recording."""
 
     format: str  # in words: "text", "HDF5 (event_cnn_minimal)"
-    events: Callable[[], Iterator[Events]]  # unchecked chunks, at most about CHUNK events each
+    events: Callable[[], Iterator[Events | Rows]]  # unchecked, at most about CHUNK events each
     size: tuple[int, int] | None = None  # (height, width) where the file says it
     count: int | None = None  # number of events where the file says it
     frames: Frames | None = None
     place: Callable[[int], str] = event_number  # row, from 0 -> its name in the file: "line 7"
 
 
-def open_recording(path: str | Path, sensor_size: tuple[int, int] | None = None) -> Recording:
+def open_recording(
+    path: str | Path, sensor_size: tuple[int, int] | None = None, strict: bool = False
+) -> Recording:
     """A recording of any known format -> Recording, opened but not read.
 
     sensor_size: (height, width) in pixels. Without it the file's own is taken; where the file
     names none it is inferred by reading the events once, and a notice says so.
-    Raises RecordingError for a missing, empty, unknown or damaged file; damage further on in the
-    file raises it when the events get there.
+    A file is read up to where it is damaged, and single rows that cannot be events are left out,
+    at most one in a thousand; a notice says what. strict: both raise RecordingError instead.
+    Raises RecordingError for a missing, empty, unknown or damaged file, and, when the events get
+    there, for more bad rows than that.
     """
     path = Path(path)
     if not path.exists():
@@ -79,13 +84,25 @@ def open_recording(path: str | Path, sensor_size: tuple[int, int] | None = None)
             f"{path}: not a recording of a known format: expected text or zip, an ECD or EVREAL "
             "folder, HDF5, N-Caltech101 .bin, .dat, .raw, .aedat4, .es, or a ROS bag"
         )
-    height, width = sensor_size or _stated(path, source) or _infer_size(path, source)
+    said = 0
+
+    def say(sentence: str, rows: int) -> None:
+        """Once; again only by a pass that has read more."""
+        nonlocal said
+        if rows > said:
+            logger.warning("%s (--strict refuses that)", sentence)
+        said = max(said, rows)
+
+    def events(height: int | None, width: int | None) -> Iterator[Events]:
+        return checked(source.events(), path, height, width, source.place, strict, say)
+
+    height, width = sensor_size or _stated(path, source) or _infer_size(path, events(None, None))
     return Recording(
         path=path,
         format=source.format,
         height=int(height),
         width=int(width),
-        events=lambda: checked(source.events(), path, height, width, source.place),
+        events=lambda: events(height, width),
         count=source.count,
         frames=source.frames,
     )
@@ -104,12 +121,12 @@ def _stated(path: Path, source: Source) -> tuple[int, int] | None:
     return height, width
 
 
-def _infer_size(path: Path, source: Source) -> tuple[int, int]:
+def _infer_size(path: Path, events: Iterator[Events]) -> tuple[int, int]:
     """Reads all events for the largest coordinates: no file of this format names its sensor."""
     height = width = 0
-    for events in until_damage(checked(source.events(), path, None, None, source.place)):
-        height = max(height, int(events.y.max()) + 1)
-        width = max(width, int(events.x.max()) + 1)
+    for chunk in until_damage(events):
+        height = max(height, int(chunk.y.max()) + 1)
+        width = max(width, int(chunk.x.max()) + 1)
     if not height:
         raise RecordingError(
             f"{path}: holds no events: check that it was recorded and copied whole"
@@ -130,15 +147,20 @@ def in_chunks(read: Callable[[slice], Events], count: int) -> Iterator[Events]:
 
 def joined(chunks: Iterable[Events], least: int = CHUNK // 4) -> Iterator[Events]:
     """Tiny chunks -> chunks of at least so many events: for formats made of packets."""
-    waiting, count = [], 0
-    for events in chunks:
-        waiting.append(events)
-        count += len(events)
-        if count >= least:
-            yield concatenate(waiting)
-            waiting, count = [], 0
+    waiting, count, damage = [], 0, None
+    try:
+        for events in chunks:
+            waiting.append(events)
+            count += len(events)
+            if count >= least:
+                yield concatenate(waiting)
+                waiting, count = [], 0
+    except RecordingError as error:  # after what came before it
+        damage = error
     if count:
         yield concatenate(waiting)
+    if damage is not None:
+        raise damage
 
 
 def microseconds(seconds: np.ndarray) -> np.ndarray:
@@ -156,9 +178,9 @@ def frame_times(path: Path, times: np.ndarray) -> np.ndarray:
 
 def to_events(
     path: Path, row: int, t, x, y, p, place: Callable[[int], str] = event_number
-) -> Events:
-    """Columns as a file holds them -> Events; refuses what those cannot hold, naming the row, in a
-    RecordingError that has the events before it.
+) -> Events | Rows:
+    """Columns as a file holds them -> Events; Rows where some hold what events cannot, with an
+    error that names the first of them, for `events.checked` to judge.
 
     t: microseconds where integer, seconds where floating; p: bool, 0 and 1, or -1 and 1.
     row: the number of the first row in the recording, for `place`.
@@ -167,34 +189,38 @@ def to_events(
     if not t.size:
         return Events.empty()
 
-    def refuse(bad: np.ndarray, column: np.ndarray, name: str, expected: str):
-        first = int(np.argmax(bad))
-        error = RecordingError(
-            f"{path}, {place(row + first)}: {name} is {column[first]}, {expected}: "
-            "the file is damaged or of another format"
-        )
-        error.before = to_events(path, row, t[:first], x[:first], y[:first], p[:first], place)
-        raise error
-
+    wrong: list[tuple[np.ndarray, np.ndarray, str, str]] = []  # bad rows, and what is said of them
     for name, column in (("the time", t), ("x", x), ("y", y), ("the polarity", p)):
         if column.dtype.kind not in "biuf":
             raise RecordingError(f"{path}: {name} is stored as {column.dtype}, expected numbers")
     latest = LATEST / 1e6 if t.dtype.kind == "f" else LATEST
     if not (-latest < t.min() and t.max() < latest):  # so put that NaN fails
-        refuse(~(np.abs(t) < latest), t, "the time", "expected seconds or whole microseconds")
+        bad = ~((-latest < t) & (t < latest))
+        wrong.append((bad, t, "the time", "expected seconds or whole microseconds"))
     for name, column in (("x", x), ("y", y)):
         if column.dtype.kind == "f" and (column != np.rint(column)).any():  # so does NaN
-            refuse(column != np.rint(column), column, name, "expected a whole number of pixels")
+            bad = column != np.rint(column)
+            wrong.append((bad, column, name, "expected a whole number of pixels"))
         if not (-REACH <= column.min() and column.max() < REACH):
-            bad = (column < -REACH) | (column >= REACH)
-            refuse(bad, column, name, f"expected a coordinate below {REACH}")
+            bad = ~((column >= -REACH) & (column < REACH))
+            wrong.append((bad, column, name, f"expected a coordinate below {REACH}"))
     if p.dtype.kind != "b":
         if p.dtype.kind == "f" or p.min() < -1 or p.max() > 1:
             bad = ~np.isin(p, (-1, 0, 1))
             if bad.any():
-                refuse(bad, p, "the polarity", "expected 0 or 1 (or -1 or 1)")
+                wrong.append((bad, p, "the polarity", "expected 0 or 1 (or -1 or 1)"))
         p = p > 0
-    return Events.of(microseconds(t) if t.dtype.kind == "f" else t, x, y, p)
+    if not wrong:
+        return Events.of(microseconds(t) if t.dtype.kind == "f" else t, x, y, p)
+    bad = np.logical_or.reduce([entry[0] for entry in wrong])
+    first = int(np.argmax(bad))
+    _, column, name, expected = next(entry for entry in wrong if entry[0][first])
+    error = RecordingError(
+        f"{path}, {place(row + first)}: {name} is {column[first]}, {expected}: "
+        "the file is damaged or of another format"
+    )
+    t, x, y = (np.where(bad, 0, column) for column in (t, x, y))
+    return Rows(Events.of(microseconds(t) if t.dtype.kind == "f" else t, x, y, p), bad, error)
 
 
 def to_frame(picture: np.ndarray, path: Path) -> np.ndarray:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firenet_jax.events import Events, RecordingError
+from firenet_jax.events import Events, RecordingError, Rows
 from firenet_jax.readers import CHUNK, Source, to_events, unwrap
 
 TYPES = (0x00, 0x0C)
@@ -52,13 +52,9 @@ def read(path: Path) -> Source:
     if version not in VERSIONS:
         raise RecordingError(f"{path}: is of version {version}, expected 0, 1 or 2")
     count, left = divmod(path.stat().st_size - start, 8)
-    if left:
-        raise RecordingError(
-            f"{path}: ends within an event: the file is cut off: copy or download it again"
-        )
     layout = VERSIONS[version]
     size = header_size(header)
-    return Source("Prophesee DAT", lambda: _events(path, start, count, layout), size, count)
+    return Source("Prophesee DAT", lambda: _events(path, start, count, layout, left), size, count)
 
 
 def read_header(file: BufferedReader) -> str:
@@ -80,7 +76,10 @@ def header_size(header: str) -> tuple[int, int] | None:
     return (int(height[1]), int(width[1])) if height and width else None
 
 
-def _events(path: Path, start: int, count: int, layout: Layout) -> Iterator[Events]:
+def _events(
+    path: Path, start: int, count: int, layout: Layout, left: int
+) -> Iterator[Events | Rows]:
+    """left: bytes of an event that is not whole, at the end"""
     row, last = 0, 0
     with open(path, "rb") as file:
         file.seek(start)
@@ -93,3 +92,7 @@ def _events(path: Path, start: int, count: int, layout: Layout) -> Iterator[Even
             p = fields >> (layout.x_bits + layout.y_bits) & 1
             yield to_events(path, row, t, x, y, p)
             row, last = row + len(t), int(t[-1])
+    if left:
+        raise RecordingError(
+            f"{path}: ends within an event: the file is cut off: copy or download it again"
+        )

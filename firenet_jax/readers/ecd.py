@@ -86,6 +86,10 @@ def _frames(path: Path) -> Frames | None:
             )
         if PurePath(name).is_absolute() or ".." in PurePath(name).parts:
             raise RecordingError(f"{path}, images.txt, line {number}: {name!r} lies elsewhere")
+        if "\0" in name:
+            raise RecordingError(
+                f"{path}, images.txt, line {number}: {name!r} is no name of a file"
+            )
         names.append(name)
     if not names:
         return None

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firenet_jax.events import Events, RecordingError
+from firenet_jax.events import Events, RecordingError, Rows
 from firenet_jax.readers import CHUNK, Source, to_events
 
 MARK = 240
@@ -28,19 +28,14 @@ def matches(path: Path) -> bool:
 
 def read(path: Path) -> Source:
     size = path.stat().st_size
-    if size % 5:
-        raise RecordingError(
-            f"{path}: has {size} bytes, expected a multiple of 5: the file is cut off or of "
-            "another format"
-        )
     return Source("N-Caltech101", lambda: _events(path, size))
 
 
-def _events(path: Path, size: int) -> Iterator[Events]:
+def _events(path: Path, size: int) -> Iterator[Events | Rows]:
     row, marks = 0, 0
     with open(path, "rb") as file:
         # Not to the end: a file that is still being written may end within an event by now.
-        while data := file.read(min(5 * CHUNK, size - file.tell())):
+        while data := file.read(min(5 * CHUNK, size - size % 5 - file.tell())):
             x, y, high, middle, low = np.frombuffer(data, np.uint8).reshape(-1, 5).T
             t = (high & 0x7F).astype(np.int64) << 16 | middle.astype(np.int64) << 8 | low
             is_mark = y == MARK
@@ -50,3 +45,8 @@ def _events(path: Path, size: int) -> Iterator[Events]:
             events = to_events(path, row, *columns)
             row += len(events)
             yield events
+    if size % 5:
+        raise RecordingError(
+            f"{path}: has {size} bytes, expected a multiple of 5: the file is cut off or of "
+            "another format"
+        )

@@ -13,7 +13,9 @@ is put at the time in its message's header, so events and frames agree but for t
 Messages are decoded from their bytes: ROS 1 packs fields, ROS 2 (CDR) aligns each to its size.
 """
 
+import contextlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import chain
 from os.path import commonprefix
 from pathlib import Path
@@ -23,6 +25,7 @@ import numpy as np
 
 from firenet_jax.events import Events, Frames, RecordingError, logger
 from firenet_jax.readers import Source, evt3, extra, joined, reading, to_events, to_frame
+from firenet_jax.readers.torn_bag import Torn
 
 ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
@@ -60,8 +63,19 @@ def _is_ros1(path: Path) -> bool:
     return path.suffix.lower() == ".bag" and path.is_file()
 
 
+@contextmanager
 def _bag(path: Path):
-    return extra("rosbags.rosbag1" if _is_ros1(path) else "rosbags.rosbag2", path).Reader(path)
+    """The bag; a ROS 1 bag that cannot be opened is read without its index, as far as it goes."""
+    library = extra("rosbags.rosbag1" if _is_ros1(path) else "rosbags.rosbag2", path)
+    opened = contextlib.ExitStack()
+    try:
+        bag = opened.enter_context(library.Reader(path))
+    except Exception:  # damaged bytes reach every kind
+        bag = Torn(path) if _is_ros1(path) else None
+        if bag is None or not bag.connections:
+            raise
+    with opened:
+        yield bag
 
 
 def _only(path: Path, found: list[str], topics: dict[str, str]) -> str:
@@ -200,15 +214,21 @@ def _mono(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, .
 def _evt3(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, ...]]]:
     """Alone until the first event is known, whose stamp counts; then many messages at once."""
     state, waiting, started, order = evt3.State(), bytearray(), False, "<"
-    for packet in packets:
-        waiting += packet.payload
-        order = packet.words
-        if started and len(waiting) < 2 * WORDS:
-            continue
-        state, columns = evt3.decode(state, np.frombuffer(bytes(waiting), order + "u2"))
-        waiting, started = bytearray(), started or len(columns[0]) > 0
-        yield packet.stamp, columns
+    damage = None
+    try:
+        for packet in packets:
+            waiting += packet.payload
+            order = packet.words
+            if started and len(waiting) < 2 * WORDS:
+                continue
+            state, columns = evt3.decode(state, np.frombuffer(bytes(waiting), order + "u2"))
+            waiting, started = bytearray(), started or len(columns[0]) > 0
+            yield packet.stamp, columns
+    except Exception as error:  # whatever a library says of damage: after what came before it
+        damage = error
     yield 0, evt3.decode(state, np.frombuffer(bytes(waiting), order + "u2"))[1]
+    if damage is not None:
+        raise damage
 
 
 DECODERS = {"evt3": _evt3, "mono": _mono}
@@ -218,13 +238,14 @@ def _frames(path: Path, bag, topic: str | None) -> Frames | None:
     if topic is None:
         return None
     stamps, recorded, ros2 = [], [], not _is_ros1(path)
-    for time, raw in _raw(bag, topic):
-        message = _Message(raw, ros2)
-        stamps.append(message.header())
-        if not recorded and (encoding := _encoding(message)) not in CHANNELS:
-            logger.warning("%s: images of %s are %s: no frames", path, topic, encoding)
-            return None
-        recorded.append(time)
+    with contextlib.suppress(ValueError if isinstance(bag, Torn) else ()):  # events will say so
+        for time, raw in _raw(bag, topic):
+            message = _Message(raw, ros2)
+            stamps.append(message.header())
+            if not recorded and (encoding := _encoding(message)) not in CHANNELS:
+                logger.warning("%s: images of %s are %s: no frames", path, topic, encoding)
+                return None
+            recorded.append(time)
 
     def read(i: int) -> np.ndarray:
         with reading(path, Exception), _bag(path) as bag:

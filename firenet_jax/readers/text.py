@@ -17,7 +17,7 @@ import gzip
 import re
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -27,7 +27,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 
-from firenet_jax.events import REACH, Events, RecordingError, logger
+from firenet_jax.events import REACH, Events, RecordingError, Rows, logger
 from firenet_jax.readers import Source, reading, to_events
 
 BLOCK = 1 << 21  # bytes parsed at once: about 90,000 events
@@ -200,7 +200,7 @@ def _is_number(word: str) -> bool:
         float(word)
     except ValueError:
         return False
-    return "_" not in word  # which Python's own numbers may have
+    return word.isascii() and "_" not in word  # as Python's own numbers need not be
 
 
 def _words(line: str, separator: str) -> list[str]:
@@ -248,14 +248,26 @@ def _blocks(path: Path, member: str | None, skip: int) -> Iterator[tuple[int, by
         yield number, rest.removeprefix(b"\xef\xbb\xbf")
 
 
-def _events(path: Path, member: str | None, layout: Layout) -> Iterator[Events]:
+def _events(path: Path, member: str | None, layout: Layout) -> Iterator[Events | Rows]:
     for number, block in _blocks(path, member, layout.skip):
         if not block or block.isspace():
             continue
-        for table in _parse(path, number, block, layout):
-            t, *others = (table[name].to_numpy() for name in "txyp")
-            t = _scaled(t, layout.unit)
-            yield to_events(path, 0, t, *others, partial(_line, number, block))
+        place = partial(_line, number, block)
+        try:
+            try:
+                table = _table(block, layout)
+            except pa.ArrowInvalid:
+                # once more with single spaces between words: rare, and it costs a third of the time
+                table = _table(_tidied(block, layout.separator), layout)
+        except pa.ArrowInvalid:
+            yield _sorted_out(path, number, block, layout, place)
+            continue
+        yield to_events(path, 0, *_columns(table, layout), place)
+
+
+def _columns(table: pa.Table, layout: Layout) -> list[np.ndarray]:
+    t, *others = (table[name].to_numpy() for name in "txyp")
+    return [_scaled(t, layout.unit), *others]
 
 
 def _scaled(t: np.ndarray, unit: float | None) -> np.ndarray:
@@ -265,25 +277,6 @@ def _scaled(t: np.ndarray, unit: float | None) -> np.ndarray:
     if t.dtype.kind == "f":
         return t * (unit / 1e6)
     return t if unit == 1 else t // 1000
-
-
-def _parse(path: Path, number: int, block: bytes, layout: Layout) -> Iterator[pa.Table]:
-    """Rows up to the first line that is none, which raises RecordingError: once they are used."""
-    try:
-        try:
-            table = _table(block, layout)
-        except pa.ArrowInvalid:
-            # once more with single spaces between words: rare, and it costs a third of the time
-            table = _table(_tidied(block, layout.separator), layout)
-    except pa.ArrowInvalid as error:
-        good, said = _fault(number, block, layout)
-        if good := b"\n".join(block.split(b"\n")[:good]).strip():
-            yield _table(_tidied(good, layout.separator), layout)
-        raise RecordingError(
-            f"{path}, {said}" if said else
-            f"{path}, in the lines from {number}: not rows of t x y p ({error})"
-        ) from error  # fmt: skip
-    yield table
 
 
 def _table(block: bytes, layout: Layout) -> pa.Table:
@@ -307,30 +300,59 @@ def _tidied(block: bytes, separator: str) -> bytes:
     return block if separator == "," else block.replace(b" ", separator.encode())
 
 
-def _fault(start: int, block: bytes, layout: Layout) -> tuple[int, str]:
-    """(lines before the first one that is no event, what is wrong with it), in Python's time."""
-    columns = len(layout.names)
-    for good, line in enumerate(block.decode("utf-8", "replace").split("\n")):
-        words, where = _words(line.strip(), layout.separator), f"line {start + good}"
-        if not line.strip():
-            continue
-        if len(words) != columns:
-            found, expected = _count(len(words)), _count(columns, "")
-            return good, f"{where}: {found} instead of {expected}: {_shown(line)}"
-        for name, word in zip(layout.names, words, strict=True):
-            if name in EXPECTED and not _fits(word, layout.types[name]):
-                what, expected = EXPECTED[name]
-                if name == "t" and layout.types["t"] == pa.int64():
-                    expected = "whole microseconds, as in the first lines"
-                return good, f"{where}: {what} is {word}, expected {expected}"
-    return 0, ""
+def _sorted_out(
+    path: Path, number: int, block: bytes, layout: Layout, place: Callable[[int], str]
+) -> Rows:
+    """A block with lines that are no events, line by line, in Python's time."""
+    good, bad, said = [], [], ""
+    for line in filter(None, map(str.strip, block.decode("utf-8", "replace").split("\n"))):
+        fault = _fault(line, layout)
+        if fault and not said:
+            said = f"{path}, {place(len(bad))}: {fault}"
+        bad.append(bool(fault))
+        good += [] if fault else [line]
+    columns = [[]] * 4
+    try:
+        if good:
+            rows = _tidied("\n".join(good).encode(), layout.separator)
+            columns = _columns(_table(rows, layout), layout)
+        if not said or len(columns[0]) != len(good):
+            raise pa.ArrowInvalid("rows that only a person can tell apart")
+    except pa.ArrowInvalid as error:
+        raise RecordingError(
+            f"{path}, in the lines from {number}: not rows of t x y p ({_shown(str(error))})"
+        ) from error
+    bad = np.array(bad)
+    everything = []
+    for column in map(np.asarray, columns):  # rows that are none are zero
+        everything.append(np.zeros(len(bad), column.dtype))
+        everything[-1][~bad] = column
+    rest = to_events(path, 0, *everything, place)
+    if isinstance(rest, Events):
+        return Rows(rest, bad, RecordingError(said))
+    earlier = np.argmax(rest.bad) < np.argmax(bad)
+    return Rows(rest.events, bad | rest.bad, rest.error if earlier else RecordingError(said))
+
+
+def _fault(line: str, layout: Layout) -> str:
+    """What is wrong with a line; nothing where it is an event."""
+    words, columns = _words(line, layout.separator), len(layout.names)
+    if len(words) != columns:
+        return f"{_count(len(words))} instead of {_count(columns, '')}: {_shown(line)}"
+    for name, word in zip(layout.names, words, strict=True):
+        if name in EXPECTED and not _fits(word, layout.types[name]):
+            what, expected = EXPECTED[name]
+            if name == "t" and layout.types["t"] == pa.int64():
+                expected = "whole microseconds, as in the first lines"
+            return f"{what} is {_shown(word)[1:-1]}, expected {expected}"
+    return ""
 
 
 def _fits(word: str, kind: pa.DataType) -> bool:
     if kind == pa.float64():
         return _is_number(word)
     limit = 2 ** (kind.bit_width - 1)
-    return re.fullmatch(r"-?\d+", word) is not None and -limit <= int(word) < limit
+    return re.fullmatch(r"-?[0-9]{1,19}", word) is not None and -limit <= int(word) < limit
 
 
 def _count(number: int, noun: str = " words") -> str:

@@ -1,0 +1,242 @@
+"""AEDAT4 -> Source: iniVation's file, packets of events and frames, each compressed by itself.
+
+    14 bytes     #!AER-DAT4.0\\r\\n
+    uint32       size of the header, a flatbuffer: compression (0 none, 1 and 2 LZ4, 3 and 4 ZSTD),
+                 where the packets end (-1: not known), XML that names the streams and their sizes
+    packets      int32 stream, int32 size, so many bytes: a flatbuffer behind its own size
+      EVTS       a vector of events, 16 bytes each: int64 time, int16 x, int16 y, bool
+      FRME       times (0: of the frame, 3 and 4: of its exposure), format, width, height, pixels
+      others     are passed over
+    table        of all packets, compressed too; not read
+
+Numbers are little-endian, times microseconds; a frame is at the middle of its exposure. Of several
+cameras the first is read. Each number that says where others are is checked before it is followed:
+libraries for this format end the whole process at a damaged file (faery), or are large.
+"""
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+import pyarrow as pa
+
+from firenet_jax.events import Events, Frames, RecordingError, Rows
+from firenet_jax.readers import Source, joined, reading, to_events, to_frame
+
+MAGIC = b"#!AER-DAT4.0\r\n"
+CODECS = {0: None, 1: "lz4", 2: "lz4", 3: "zstd", 4: "zstd"}
+HEADER = 1 << 24  # bytes of a header at most
+PACKET = 1 << 28  # bytes of an unpacked packet at most: 16 million events
+HEAD = 1 << 10  # bytes of a frame in which all but its pixels lies
+EVENT = np.dtype(
+    {
+        "names": ["t", "x", "y", "on"],
+        "formats": ["<i8", "<i2", "<i2", "u1"],
+        "offsets": [0, 8, 10, 12],
+        "itemsize": 16,
+    }
+)
+CHANNELS = {0: 1, 16: 3, 24: 4}  # OpenCV's numbers for grey, BGR, BGRA of 8 bits
+DAMAGED = struct.error, ValueError, IndexError, OSError  # what damaged bytes raise here
+
+
+class Layout(NamedTuple):
+    """What the header says."""
+
+    codec: str | None
+    begin: int  # of the packets, bytes from the beginning of the file
+    end: int | None  # of the packets; None: that of the file
+    events: int  # stream
+    frames: int | None  # stream; None: no frames
+    size: tuple[int, int] | None  # (height, width)
+
+
+def matches(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() == ".aedat4"
+
+
+def read(path: Path) -> Source:
+    layout = _layout(path)
+    frames = _frames(path, layout)
+    return Source("AEDAT4", lambda: joined(_events(path, layout)), layout.size, frames=frames)
+
+
+# ---- Flatbuffers: a table says where its fields are, a vector how long it is
+
+
+def _number(data: bytes, at: int, kind: str) -> int:
+    """kind: as in `struct`. Raises struct.error where it lies outside."""
+    if at < 0:
+        raise ValueError("a place before the beginning")
+    return struct.unpack_from("<" + kind, data, at)[0]
+
+
+def _root(data: bytes, start: int = 0) -> int:
+    return start + _number(data, start, "I")
+
+
+def _field(data: bytes, table: int, number: int, kind: str, default: int | None = None):
+    """A number of a table; with the kind "at" the place that it points to."""
+    entries = table - _number(data, table, "i")
+    offset = 0
+    if 4 + 2 * number < _number(data, entries, "H"):
+        offset = _number(data, entries + 4 + 2 * number, "H")
+    if not offset:
+        return default
+    if kind != "at":
+        return _number(data, table + offset, kind)
+    return table + offset + _number(data, table + offset, "I")
+
+
+def _vector(data: bytes, at: int, itemsize: int) -> tuple[int, int]:
+    """(place of its first entry, how many there are)"""
+    count = _number(data, at, "I")
+    if at + 4 + count * itemsize > len(data):
+        raise ValueError("a list that goes on behind the end")
+    return at + 4, count
+
+
+# ---- The file
+
+
+def _layout(path: Path) -> Layout:
+    damaged = f"{path}: its header is damaged"
+    remedy = "copy or download it again"
+    with open(path, "rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise RecordingError(
+                f"{path}: cannot be read as AEDAT4: it begins in another way: {remedy}"
+            )
+        try:
+            size = _number(file.read(4), 0, "I")
+            if size > HEADER:
+                raise ValueError(f"of {size} bytes")
+            header, begin = file.read(size), file.tell()
+            table = _root(header)
+            codec = _field(header, table, 0, "i", 0)
+            end = _field(header, table, 1, "q", -1)
+            start, count = _vector(header, _field(header, table, 2, "at", -1), 1)
+            streams = _streams(header[start : start + count])
+        except (*DAMAGED, ElementTree.ParseError) as error:
+            raise RecordingError(f"{damaged} ({error}): {remedy}") from error
+    if codec not in CODECS:
+        raise RecordingError(f"{damaged} (compression {codec}): {remedy}")
+    events = [number for number, (kind, _) in streams.items() if kind == "EVTS"]
+    if not events:
+        kinds = ", ".join(sorted({kind for kind, _ in streams.values()})) or "nothing"
+        raise RecordingError(f"{path}: holds no events, but {kinds}: record them too")
+    frames = [number for number, (kind, _) in streams.items() if kind == "FRME"]
+    return Layout(
+        CODECS[codec],
+        begin,
+        end if end >= begin else None,
+        events[0],
+        frames[0] if frames else None,
+        streams[events[0]][1],
+    )
+
+
+def _streams(text: bytes) -> dict[int, tuple[str, tuple[int, int] | None]]:
+    """XML -> number of a stream: (kind, (height, width) if it says so)"""
+    found = {}
+    for node in ElementTree.fromstring(text.rstrip(b"\0").strip()).iter("node"):
+        said = {attribute.get("key"): attribute.text for attribute in node.findall("attr")}
+        if "typeIdentifier" not in said:
+            continue
+        inside = {attribute.get("key"): attribute.text for attribute in node.iter("attr")}
+        sides = inside.get("sizeY"), inside.get("sizeX")
+        size = (int(sides[0]), int(sides[1])) if all(sides) else None
+        found[int(node.get("name") or -1)] = said["typeIdentifier"], size
+    return found
+
+
+def _packets(path: Path, file: BinaryIO, layout: Layout, stream: int) -> Iterator[tuple[int, int]]:
+    """(place, size) of the packets of a stream; the file is left anywhere."""
+    at, end = layout.begin, path.stat().st_size
+    last = end if layout.end is None else layout.end
+    while at < last:
+        file.seek(at)
+        head = file.read(8)
+        number, size = struct.unpack("<ii", head) if len(head) == 8 else (0, -1)
+        if len(head) < 8 or size < 0 or at + 8 + size > end:
+            raise RecordingError(
+                f"{path}: cannot be read from byte {at} on, where no whole packet is: the file is "
+                "cut off or damaged: copy or download it again"
+            )
+        if number == stream:
+            yield at + 8, size
+        at += 8 + size
+
+
+def _unpacked(file: BinaryIO, layout: Layout, place: int, size: int, most: int = PACKET) -> bytes:
+    """A packet's flatbuffer, or the first bytes of it, without the size before it."""
+    file.seek(place)
+    data = file.read(size)
+    if layout.codec:
+        with pa.CompressedInputStream(pa.BufferReader(data), layout.codec) as stream:
+            data = stream.read(most + 1)
+    if len(data) > most and most == PACKET:
+        raise ValueError(f"more than {PACKET >> 20} MB unpacked")
+    return data[4:]
+
+
+def _events(path: Path, layout: Layout) -> Iterator[Events | Rows]:
+    row = 0
+    with open(path, "rb") as file:
+        for place, size in _packets(path, file, layout, layout.events):
+            with reading(path, *DAMAGED):
+                data = _unpacked(file, layout, place, size)
+                start = _field(data, _root(data), 0, "at")
+                if start is None:  # a packet of nothing
+                    continue
+                start, count = _vector(data, start, EVENT.itemsize)
+                events = np.frombuffer(data, EVENT, count, start)
+            chunk = to_events(path, row, events["t"], events["x"], events["y"], events["on"] != 0)
+            yield chunk
+            row += len(chunk)
+
+
+# ---- Frames
+
+
+def _frames(path: Path, layout: Layout) -> Frames | None:
+    """Up to the first that is damaged: whoever reads the events will hear of it."""
+    if layout.frames is None:
+        return None
+    times, places = [], []
+    try:
+        with open(path, "rb") as file:
+            for place, size in _packets(path, file, layout, layout.frames):
+                times.append(_time(_unpacked(file, layout, place, size, HEAD)))
+                places.append((place, size))
+    except (RecordingError, *DAMAGED):
+        pass
+    if not places:
+        return None
+    times = np.array(times[: len(places)], np.int64)
+    return Frames(times, lambda i: _frame(path, layout, places[i]))
+
+
+def _time(data: bytes) -> int:
+    table = _root(data)
+    begin, end = (_field(data, table, number, "q", 0) for number in (3, 4))
+    return (begin + end) // 2 if begin and end else _field(data, table, 0, "q", 0)
+
+
+def _frame(path: Path, layout: Layout, packet: tuple[int, int]) -> np.ndarray:
+    with open(path, "rb") as file, reading(path, *DAMAGED):
+        data = _unpacked(file, layout, *packet)
+        table = _root(data)
+        kind = _field(data, table, 5, "b", 0)
+        width, height = (_field(data, table, number, "h", 0) for number in (6, 7))
+        if kind not in CHANNELS:
+            raise ValueError(f"a frame of format {kind}")
+        start, count = _vector(data, _field(data, table, 10, "at", -1), 1)
+        shape = height, width, CHANNELS[kind]
+        if min(height, width) < 1 or count != height * width * CHANNELS[kind]:
+            raise ValueError(f"a frame of {width}x{height} in {count} bytes")
+        pixels = np.frombuffer(data, np.uint8, count, start).reshape(shape)
+    return to_frame(pixels[..., 2::-1] if shape[2] > 1 else pixels, path)

@@ -1,0 +1,111 @@
+"""A ROS 1 bag whose index is missing, as it was cut off -> its messages, from the beginning on.
+
+A record is uint32 size, header, uint32 size, data; a header is fields, uint32 size and `name=value`
+each. The field `op` says what a record holds:
+
+    3  the bag's header          5  a chunk: further records, compressed as a whole
+    7  a connection: its number, its topic; its type in the data, which are fields again
+    2  a message: its connection, its time of recording      4, 6  indexes, which are not read
+"""
+
+import bz2
+import io
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import pyarrow as pa
+
+MAGIC = b"#ROSBAG V2.0\n"
+CHUNK, CONNECTION, MESSAGE = 5, 7, 2
+LARGEST = 1 << 28  # bytes of a record, as it is in the file and unpacked
+
+
+class Connection(NamedTuple):
+    topic: str
+    msgtype: str  # as ROS 2 writes it: dvs_msgs/msg/EventArray
+
+
+class Torn:
+    """What a reader of rosbags offers, as far as it is used here."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.known: dict[int, Connection] = {}
+        self.ended: Exception | None = None
+        for _ in self._messages():  # connections are told before their first message
+            pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    @property
+    def connections(self) -> list[Connection]:
+        return list(self.known.values())
+
+    def messages(self, connections, start: int | None = None) -> Iterator[tuple]:
+        """(connection, time of recording in ns, bytes), not before `start`. Raises ValueError at
+        the end: a bag without an index was not closed."""
+        for connection, time, data in self._messages():
+            if connection in connections and time >= (start or 0):
+                yield connection, time, data
+        raise ValueError("it has no index, so it ends early") from self.ended
+
+    def _messages(self) -> Iterator[tuple]:
+        with open(self.path, "rb") as file:
+            try:
+                if file.read(len(MAGIC)) != MAGIC:
+                    raise ValueError("it is no bag")
+                yield from self._inside(file)
+            except (ValueError, KeyError, struct.error, OSError, EOFError) as error:
+                self.ended = error
+
+    def _inside(self, file: BinaryIO) -> Iterator[tuple]:
+        while size := file.read(4):
+            header = _fields(_bytes(file, size))
+            data = _bytes(file, file.read(4))
+            kind = header["op"][0]
+            if kind == CHUNK:
+                inside = self._inside(io.BytesIO(_unpacked(data, header["compression"])))
+                yield from sorted(inside, key=lambda message: message[1])  # as an index would
+            elif kind == CONNECTION:
+                package, _, name = _fields(data)["type"].decode().rpartition("/")
+                number = struct.unpack("<I", header["conn"])[0]
+                self.known[number] = Connection(header["topic"].decode(), f"{package}/msg/{name}")
+            elif kind == MESSAGE:
+                seconds, nanoseconds = struct.unpack("<II", header["time"])
+                number = struct.unpack("<I", header["conn"])[0]
+                yield self.known[number], seconds * 10**9 + nanoseconds, data
+
+
+def _bytes(file: BinaryIO, size: bytes) -> bytes:
+    size = struct.unpack("<I", size)[0]
+    data = file.read(size) if size <= LARGEST else b""
+    if len(data) != size:
+        raise EOFError("ends within a record")
+    return data
+
+
+def _fields(data: bytes) -> dict[str, bytes]:
+    found, at = {}, 0
+    while at < len(data):
+        size = struct.unpack_from("<I", data, at)[0]
+        name, _, value = data[at + 4 : at + 4 + size].partition(b"=")
+        found[name.decode()] = value
+        at += 4 + size
+    return found
+
+
+def _unpacked(data: bytes, how: bytes) -> bytes:
+    if how == b"none":
+        return data
+    if how == b"bz2":
+        return bz2.BZ2Decompressor().decompress(data, LARGEST)
+    if how == b"lz4":
+        with pa.CompressedInputStream(pa.BufferReader(data), "lz4") as stream:
+            return stream.read(LARGEST)
+    raise ValueError(f"a chunk compressed by {how!r}")
