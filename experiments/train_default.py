@@ -318,8 +318,17 @@ AGES = replace(
         hot=(1e-7, 5e-4),
     ),
 )
-# The rate down to nothing.
-AGED = replace(AGES, steps=250, warmup=5, learning_rate=3e-4, seed=121)
+# Everything stops for good, and brightness counts again: after a hundred windows with nothing new
+# images had sunk to black. The rate falls to nothing.
+AGED = replace(
+    AGES,
+    steps=560,
+    warmup=10,
+    learning_rate=6e-4,
+    seed=121,
+    loss=replace(AGES.loss, l1=1.0),
+    scene=replace(AGES.scene, halt=0.3),
+)
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
@@ -339,7 +348,7 @@ STAGES = {
     "noise": (NOISE, None),
     "still": (STILL, None),
     "detail": (DETAIL, None),
-    "ages": (AGES, 700),
+    "ages": (AGES, 500),
     "aged": (AGED, None),
 }
 # Parts of a mean: what a stage starts from, if not from the one before.

@@ -60,6 +60,9 @@ class SceneSettings:
     """Pixels per second of the fastest point at its fastest time, drawn log-uniformly."""
     pause: float = 0.3
     """How probable it is that everything stands still for a while, in each half of the scene."""
+    halt: float = 0.0
+    """How probable it is that everything stops for good, in the first third of the scene: what was
+    seen must stay, however long nothing follows."""
     still: float = 0.0
     """How probable it is that the camera stands still all the time, where there are objects to
     move before it."""
@@ -90,7 +93,7 @@ class SceneSettings:
     def __post_init__(self):
         for name in ("speed", "zoom", "blur", "size", "softness", "gamma"):
             check_range(name, getattr(self, name))
-        for name in ("pause", "still", "plain", "hdr"):
+        for name in ("pause", "halt", "still", "plain", "hdr"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, but is a probability, 0 to 1")
         if self.objects < 0:
@@ -204,6 +207,12 @@ def random_scene(
     length = duration * uniform((0.02, 0.5 - 0.3 - 0.02), (PAUSES,))
     length = jnp.where(uniform((0.0, 1.0), (PAUSES,)) < settings.pause, length, 0.0)
     pauses = jnp.stack([start, start + length, jnp.broadcast_to(ramp, (PAUSES,))], -1)
+
+    if settings.halt:
+        halted = uniform((0.0, 1.0)) < settings.halt
+        for_good = jnp.stack([start, start + 100 * duration * jnp.array([1.0, 0.0])], -1)
+        # The second pause, of no length then, must not count twice.
+        pauses = jnp.where(halted, jnp.concatenate([for_good, pauses[:, 2:]], -1), pauses)
 
     if settings.plain:
         plain = (uniform((0.0, 1.0)) < settings.plain) & (shown > 0)
