@@ -16,6 +16,7 @@ given, ours=PATH. The questions, each a function, an entry of results/endurance.
                 how much the mean brightness moves from one picture to the next.
     frames      recordings with camera frames: SSIM and MSE, with and without local equalisation.
 
+What other weights gave before stays in the file, so that only new ones must be measured.
 Simulated pictures are textures from `textures.HELD_OUT`, which no weights of ours were trained on.
 """
 
@@ -407,7 +408,8 @@ def main():
             rows = function(methods, recordings)
         print(f"\n{name}")
         table(rows)
-        results[name] = rows
+        others = [row for row in results.get(name, []) if row["weights"] not in methods]
+        results[name] = others + rows
         if not options.quick:
             save("endurance", results)
 

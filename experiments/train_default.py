@@ -285,6 +285,7 @@ DETAIL = replace(
 # also less weight on flicker and a term of its own. It began from the built-in weights of before.
 AGES = replace(
     DETAIL,
+    textures=2048,
     batch=3,
     steps=1300,
     chain=40,

@@ -1,4 +1,6 @@
 import math
+from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -292,6 +294,24 @@ def test_motion_is_smooth_and_pauses_stand_still(scenes):
     np.testing.assert_allclose(move(scenes, a, b)[0][k], 0, atol=2e-3)
     inside = np.linspace(start + ramp, end, 60, dtype=np.float32)
     assert pace(scenes, np.broadcast_to(inside, (MANY, 60)))[k].max() < 1
+
+
+def test_everything_may_stop_for_good():
+    """Also where a second pause was drawn; before it stops and at its speed nothing changes."""
+    textures = smooth_textures()
+    for key in jax.random.split(jax.random.key(2), 4):
+        make = partial(random_scene, key, textures, duration=DURATION, **SIZE)
+        settings = SceneSettings(objects=2, speed=SPEEDS, pause=1.0)
+        usual, halted = make(settings=settings), make(settings=replace(settings, halt=1.0))
+        start, _, ramp = np.asarray(halted.pauses[0])
+        assert 0 < start < 0.31 * DURATION and start == usual.pauses[0, 0]
+        images = [
+            np.asarray(render(halted, t, **SIZE).image)
+            for t in (0.0, start + ramp, 0.7 * DURATION, 9 * DURATION)
+        ]
+        assert not np.allclose(images[0], images[1], atol=0.05)
+        for later in images[2:]:
+            np.testing.assert_allclose(later, images[1], atol=5e-3)
 
 
 def test_before_a_still_camera_only_objects_move():
