@@ -103,6 +103,7 @@ class Recording:
     events: Callable[[], Iterator[Events]]  # every call starts from the first event
     count: int | None = None  # number of events, where the file says it
     frames: Frames | None = None
+    inferred: bool = False  # whether the sensor's size is that of its events
 
     @property
     def pixels(self) -> int:

@@ -92,7 +92,17 @@ def test_info_as_lines_and_as_json(here, capsys):
     assert facts["events"] == 500 and (facts["width"], facts["height"]) == (24, 20)
     assert facts["duration_s"] == pytest.approx(np.ptp(rows[:, 0]))
     assert facts["on_share"] == pytest.approx(rows[:, 3].mean())
-    assert facts["events_per_window"] == 168 and facts["windows"] == 3
+    assert facts["events_per_window"] == 168 and not facts["sensor_size_inferred"]
+    begin, count, windows = rows[0, 0], 0, 1  # at most 40 ms and 168 events
+    for t in rows[:, 0]:
+        if round(1e6 * (t - begin)) >= 40_000 or count == 168:
+            begin, count, windows = t, 0, windows + 1
+        count += 1
+    assert facts["windows"] == windows and facts["longest_window_ms"] == 40
+    (here / "none.txt").write_text("0.1 3 4 1\n0.2 20 11 0\n")
+    facts = json.loads(firenet(capsys, "info none.txt --json")[1])
+    assert (facts["width"], facts["height"], facts["sensor_size_inferred"]) == (21, 12, True)
+    assert "21x12 pixels (inferred from the events)" in firenet(capsys, "info none.txt")[1]
 
 
 def test_convert_needs_no_pytorch_and_says_what_it_did(here, capsys, reference):
@@ -225,4 +235,4 @@ def test_info_names_hot_pixels_by_column_and_row(here, capsys):
     rows = [f"{k / 1e4:.4f} {k % 24} {k // 24 % 20} 1" for k in range(480)]
     text_with(here / "hot.txt", [*rows, *["0.5 17 4 1"] * 400])
     assert json.loads(firenet(capsys, "info hot.txt --json")[1])["hot_pixels"] == [[17, 4]]
-    assert "1 (x,y: 17,4)" in firenet(capsys, "info hot.txt")[1]
+    assert "1, (x,y): (17,4)" in firenet(capsys, "info hot.txt")[1]

@@ -21,6 +21,7 @@ LAYERS = [
         "pictures",
         "files",
         "overlap",
+        "progress",
         "pytorch_file",
         "warp",
         "equalise",

@@ -96,7 +96,8 @@ def open_recording(
     def events(height: int | None, width: int | None) -> Iterator[Events]:
         return checked(source.events(), path, height, width, source.place, strict, say)
 
-    height, width = sensor_size or _stated(path, source) or _infer_size(path, events(None, None))
+    size = sensor_size or _stated(path, source)
+    height, width = size or _infer_size(path, events(None, None))
     return Recording(
         path=path,
         format=source.format,
@@ -105,6 +106,7 @@ def open_recording(
         events=lambda: events(height, width),
         count=source.count,
         frames=source.frames,
+        inferred=size is None,
     )
 
 
