@@ -39,7 +39,7 @@ LAYERS = [
         "lpips",
         "foreign_call",
     ],
-    ["filters", "tensors", "checkpoint", "losses", "native"],
+    ["arrays", "filters", "tensors", "checkpoint", "losses", "native"],
     ["reconstruction", "sensor"],
     ["baselines"],
     ["info", "pipeline", "dataset", "batches", "methods", "report"],
