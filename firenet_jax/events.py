@@ -109,6 +109,7 @@ class Recording:
     count: int | None = None  # number of events, where the file says it
     frames: Frames | None = None
     inferred: bool = False  # whether the sensor's size is that of its events
+    grey: bool = False  # whether the file says that the sensor sees no colours
 
     @property
     def pixels(self) -> int:

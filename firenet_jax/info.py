@@ -30,15 +30,22 @@ class Info:
     """Text, zip, HDF5, ECD or EVREAL folder, .bin, .dat, .raw, .aedat4, .es, ROS bag."""
     sensor_size: str | None = None
     """WIDTHxHEIGHT of the sensor, where the recording does not say it."""
+    columns: str | None = None
+    """Order of the columns of a text that has no line of names, such as x,y,p,t."""
     strict: bool = False
     """Refuse a recording with a bad row or damage."""
     json: bool = False
     """Print JSON instead of lines."""
 
 
-def describe(path: Path, sensor_size: tuple[int, int] | None = None, strict: bool = False) -> dict:
+def describe(
+    path: Path,
+    sensor_size: tuple[int, int] | None = None,
+    strict: bool = False,
+    columns: str | None = None,
+) -> dict:
     """Facts of a recording, in the order in which a person wants them."""
-    recording = open_recording(path, sensor_size, strict)
+    recording = open_recording(path, sensor_size, strict, columns)
     windows = usual(until_damage(recording.events()))
     counts = np.zeros(recording.pixels, np.int64)
     on = first = last = None
@@ -86,7 +93,9 @@ def describe(path: Path, sensor_size: tuple[int, int] | None = None, strict: boo
 
 
 def run(settings: Info) -> None:
-    facts = describe(settings.recording, parse_size(settings.sensor_size), settings.strict)
+    facts = describe(
+        settings.recording, parse_size(settings.sensor_size), settings.strict, settings.columns
+    )
     if settings.json:
         print(json.dumps(facts, indent=2))
         return

@@ -68,7 +68,7 @@ from firenet_jax.windows import LONGEST, Window, Windows, cut, in_words, usual
 # Settings that the pictures do not depend on (on the chunk only in float32's last bits), or that
 # are told in another way.
 ELSEWHERE = ("recordings", "output", "weights", "fps", "speed", "chunk", "batch", "overwrite")
-ELSEWHERE += ("strict", "processes", "process")
+ELSEWHERE += ("columns", "strict", "processes", "process")
 RESUME_EVERY = 5.0  # seconds between two saves of what a resumed run needs
 
 
@@ -113,6 +113,8 @@ class Reconstruct:
     """Show each picture of a video for as long, so many per second, whatever its time."""
     sensor_size: str | None = None
     """WIDTHxHEIGHT of the sensor, such as 240x180, where the recording does not say it."""
+    columns: str | None = None
+    """Order of the columns of a text that has no line of names, such as x,y,p,t."""
     strict: bool = False
     """Refuse a recording with a bad row or damage, instead of leaving out what cannot be read (at
     most one event in a thousand) and reading up to the damage."""
@@ -223,7 +225,12 @@ def run(settings: Reconstruct) -> list[Path]:
     size = parse_size(settings.sensor_size)
     jobs = []
     for path, output in zip(settings.recordings[mine], outputs, strict=True):
-        recording = open_recording(path, size, settings.strict)
+        recording = open_recording(path, size, settings.strict, settings.columns)
+        if settings.network.color and recording.grey:
+            raise RecordingError(
+                f"{path}: says that its sensor sees no colours, --color would invent some: leave "
+                "it out"
+            )
         windows, speed = windows_for(recording, settings)
         chosen = dataclasses.replace(settings, windows=windows)
         job = Job(recording, output, describe(chosen, recording, weights), windows, speed)
@@ -532,7 +539,8 @@ def start(
     writer = writers[job.output] = open_writer(job.output, settings.fps, job.speed)
     try:
         recording = job.recording
-        chunks = recording.events()
+        span: list[int] = []
+        chunks = timed(recording.events(), span)
         if settings.start is not None or settings.stop is not None:
             chunks = filters.between(chunks, settings.start, settings.stop)
         if settings.hot_pixels is not None:
@@ -544,7 +552,10 @@ def start(
         done, session = load_position(job, settings)
         first = next(itertools.islice(windows, done, None), None)
         if first is None and not done:
-            raise RecordingError(f"{recording.path}: no events, or none that the filters let pass")
+            lasts = f": it lasts {(span[1] - span[0]) / 1e6:g} s" if span else ""
+            raise RecordingError(
+                f"{recording.path}: no events, or none that the filters let pass{lasts}"
+            )
     except RecordingError:
         writers.pop(job.output).abandon()
         raise
@@ -552,6 +563,13 @@ def start(
         writer.keep(done)
         events.clear()  # those of the pictures that are there
     return Running(job, windows, first, done, events, writer), session
+
+
+def timed(chunks: Iterator[Events], span: list[int]) -> Iterator[Events]:
+    """The same chunks; the times of the first event and of the last go to `span`."""
+    for chunk in chunks:
+        span[:] = [span[0] if span else int(chunk.t[0]), int(chunk.t[-1])]
+        yield chunk
 
 
 def numbered(chunks: Iterator[Events], counts: list[int]) -> Iterator[Events]:

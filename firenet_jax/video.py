@@ -28,6 +28,7 @@ OTHER_FILES = (
     ".txt", ".csv", ".json", ".raw", ".dat", ".bin", ".es", ".aedat", ".aedat4",
     ".bag", ".db3", ".mcap",
 )  # fmt: skip
+LIKE_A_FILE = re.compile(r"\.[A-Za-z][A-Za-z0-9]{2,4}")  # nor is any other such ending
 OURS = re.compile(r"timestamps\.txt|resume[.\w]*\.npz|frame_\d{10,}\.png")  # in a folder
 RATES = 0.01, 10_000  # pictures per second
 GIF_RATE = 100  # pictures per second, the most that the format can say
@@ -61,7 +62,9 @@ def check_rate(path: Path, fps: float) -> None:
 
 def check_output(path: Path, overwrite: bool) -> None:
     """Raises OutputError if something is at the final name that must not or cannot be replaced."""
-    if path.suffix.lower() in (*VIDEOS, *OTHER_FILES) and path.suffix not in VIDEOS:
+    other = path.suffix.lower() in (*VIDEOS, *OTHER_FILES)
+    other |= LIKE_A_FILE.fullmatch(path.suffix) is not None and not path.is_dir()
+    if other and path.suffix not in VIDEOS:
         raise OutputError(
             f"{path}: cannot write {path.suffix} files: name a folder (for png), .mp4 or .gif"
         )

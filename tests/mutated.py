@@ -24,9 +24,11 @@ from pathlib import Path
 import numpy as np
 
 SLOW = 60.0  # seconds
-NASTY = [b"nan", b"-1", b"1e999", b"9" * 400, "١٢٣".encode(), b"\x0c", b"\x00", b"\xff\xfe",
-         b"0x10", b"", b" ", b",", b"\n", b"\r", b'"', b"..", b"{", b"[" * 2000, b"1_000", b"\xef\xbb\xbf",
-         b"inf", b"-0", b"2147483648", b"9223372036854775808", b"1.5", b"\t"]  # fmt: skip
+NASTY = [
+    b"nan", b"-1", b"1e999", b"9" * 400, "١٢٣".encode(), b"\x0c", b"\x00", b"\xff\xfe", b"0x10",
+    b"", b" ", b",", b"\n", b"\r", b'"', b"..", b"{", b"[" * 2000, b"1_000", b"\xef\xbb\xbf",
+    b"inf", b"-0", b"2147483648", b"9223372036854775808", b"1.5", b"\t",
+]  # fmt: skip
 
 
 # ---- Whole inputs: name -> files of a folder, and which of them is read
@@ -267,11 +269,15 @@ def run(seed: int, first: int, count: int) -> tuple[collections.Counter, list[st
             counts[came.partition(":")[0]] += 1
             if came.startswith("FAULT"):
                 faults.append(f"{last}: {name}: {came}")
+                print(faults[-1], flush=True)
             number = last + 1
+            if number % 1000 == 0:
+                print(number, dict(counts), file=sys.stderr, flush=True)
         code = worker.wait()
         if number < stop:
             counts["FAULT"] += 1
             faults.append(f"{last}: {what} (exit {code})")
+            print(faults[-1], flush=True)
             number = last + 1
     return counts, faults
 
@@ -288,7 +294,6 @@ def main() -> int:
         return 0
     began = time.monotonic()
     counts, faults = run(options.seed, options.first, options.count)
-    print("\n".join(faults))
     print(f"{dict(counts)} in {time.monotonic() - began:.0f} s")
     return 1 if faults else 0
 

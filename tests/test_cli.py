@@ -236,3 +236,21 @@ def test_info_names_hot_pixels_by_column_and_row(here, capsys):
     text_with(here / "hot.txt", [*rows, *["0.5 17 4 1"] * 400])
     assert json.loads(firenet(capsys, "info hot.txt --json")[1])["hot_pixels"] == [[17, 4]]
     assert "1, (x,y): (17,4)" in firenet(capsys, "info hot.txt")[1]
+
+
+def test_options_of_the_original_program_are_explained(here, capsys):
+    for line, said in (("-i a.txt -o out", "-i is"), (f"{RUN} --auto_hdr", "--auto-range here")):
+        line = line if line.startswith("reconstruct") else f"reconstruct {line}"
+        code, _, error = firenet(capsys, line)
+        assert code == 2 and said in error and len(error.splitlines()) == 1
+    code, _, error = firenet(capsys, f"{RUN} --start 5")
+    assert code == 1 and re.search(r"a.txt: no events, .*: it lasts 0\.9\d+ s", error)
+    code, _, error = firenet(capsys, "reconstruct a.txt -o x.txt2 -c weights.npz")
+    assert code == 1 and "cannot write .txt2 files" in error
+
+
+def test_colours_of_a_sensor_that_says_it_is_grey(here, capsys):
+    words = np.array([[10, 1 | 2 << 14], [20, 3 | 4 << 14]], "<u4").tobytes()
+    (here / "a.dat").write_bytes(b"% Version 2\n% Width 24\n% Height 20\n\x00\x08" + words)
+    code, _, error = firenet(capsys, "reconstruct a.dat -o out -c weights.npz --color")
+    assert code == 1 and "sees no colours" in error and not list(here.glob("out*"))

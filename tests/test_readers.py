@@ -1271,3 +1271,30 @@ def test_more_than_one_in_a_thousand_is_an_error_wherever_it_comes(tmp_path):
     assert len(events_of(recording(0, 1500, 2999), None)) == 2997
     with pytest.raises(RecordingError, match="line 2: x is 400, outside the sensor of 320x240"):
         events_of(recording(0, 1500, 2998, 2999), None)
+
+
+# ---------------------------------------------------------------- what a new user meets
+
+
+@pytest.mark.parametrize("order", ["x,y,p,t", "p,t,x,y", "x,y,t,p", "t,p,x,y"])
+@pytest.mark.parametrize("seconds", [True, False])
+def test_columns_in_another_order_are_asked_for(tmp_path, order, seconds):
+    t = [f"{1 + i * 0.001:.6f}" if seconds else f"{10**6 + 1000 * i}" for i in range(50)]
+    x, y, p = (
+        [str((i * step) % size) for i in range(50)] for step, size in ((7, 300), (5, 30), (1, 2))
+    )
+    values = {"t": t, "x": x, "y": y, "p": p}
+    rows = [",".join(row) for row in zip(*(values[key] for key in order.split(",")), strict=True)]
+    path = write(tmp_path / "a.csv", "\n".join(rows))
+    refused(path, f"columns look like {order}, not t,x,y,p: pass --columns {order}")
+    events = concatenate(list(open_recording(path, (240, 320), columns=order).events()))
+    np.testing.assert_array_equal(events.t, 10**6 + 1000 * np.arange(50))
+    assert events.x.tolist() == [*map(int, x)] and events.y.tolist() == [*map(int, y)]
+    with pytest.raises(RecordingError, match="columns are 'x,y', expected an order"):
+        open_recording(path, columns="x,y")
+
+
+def test_which_recordings_say_that_they_are_grey(recordings):
+    for name, grey in (("davis346_frames.aedat4", True), ("dvxplorer_face.aedat4", True),
+                       ("ncars.dat", True), ("ecd_slider_depth", False)):  # fmt: skip
+        assert open_recording(recordings / name).grey is grey

@@ -50,11 +50,15 @@ class Source:
     size: tuple[int, int] | None = None  # (height, width) where the file says it
     count: int | None = None  # number of events where the file says it
     frames: Frames | None = None
+    grey: bool = False  # whether the file says that the sensor sees no colours
     place: Callable[[int], str] = event_number  # row, from 0 -> its name in the file: "line 7"
 
 
 def open_recording(
-    path: str | Path, sensor_size: tuple[int, int] | None = None, strict: bool = False
+    path: str | Path,
+    sensor_size: tuple[int, int] | None = None,
+    strict: bool = False,
+    columns: str | None = None,
 ) -> Recording:
     """A recording of any known format -> Recording, opened but not read.
 
@@ -62,6 +66,7 @@ def open_recording(
     names none it is inferred by reading the events once, and a notice says so.
     A file is read up to where it is damaged, and single rows that cannot be events are left out,
     at most one in a thousand; a notice says what. strict: both raise RecordingError instead.
+    columns: their order in a text without a line of names, such as "x,y,p,t".
     Raises RecordingError for a missing, empty, unknown or damaged file, and, when the events get
     there, for more bad rows than that.
     """
@@ -77,7 +82,9 @@ def open_recording(
     for name in FORMATS:
         module = importlib.import_module(f"{__name__}.{name}")
         if module.matches(path):
-            source = module.read(path)
+            if columns is not None and name != "text":
+                raise RecordingError(f"{path}: is no text of events, whose columns have an order")
+            source = module.read(path) if columns is None else module.read(path, columns=columns)
             break
     else:
         raise RecordingError(
@@ -107,6 +114,7 @@ def open_recording(
         count=source.count,
         frames=source.frames,
         inferred=size is None,
+        grey=source.grey,
     )
 
 
