@@ -6,14 +6,9 @@ import numpy as np
 
 from firenet_jax.events import Events, Recording, RecordingError, Rows, checked
 from firenet_jax.readers import in_chunks, to_events
+from firenet_jax.readers.text import NAMES
 
 UNITS = {"s": None, "ms": 1000, "us": 1}  # microseconds; seconds are read as floating numbers
-FIELDS = {
-    "t": ("t", "ts", "timestamp", "time"),
-    "x": ("x", "xs"),
-    "y": ("y", "ys"),
-    "p": ("p", "ps", "pol", "polarity", "on"),
-}
 
 
 def recording(
@@ -71,7 +66,7 @@ def _fields(name: str, array: np.ndarray) -> list[np.ndarray]:
             f"{name}: t alone is {array.dtype} of shape {array.shape}: pass t, x, y and p, or one "
             "structured array with these fields"
         )
-    found = {key: [n for n in names if n in array.dtype.names] for key, names in FIELDS.items()}
+    found = {key: [n for n in names if n in array.dtype.names] for key, names in NAMES.items()}
     if not all(found.values()):
         raise RecordingError(
             f"{name}: has the fields {', '.join(array.dtype.names)}, expected t, x, y and p"

@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 SLOW = 60.0  # seconds
+AT_ONCE = 1000  # inputs that one worker reads: libraries keep a little of what they have opened
 NASTY = [
     b"nan", b"-1", b"1e999", b"9" * 400, "١٢٣".encode(), b"\x0c", b"\x00", b"\xff\xfe", b"0x10",
     b"", b" ", b",", b"\n", b"\r", b'"', b"..", b"{", b"[" * 2000, b"1_000", b"\xef\xbb\xbf",
@@ -246,7 +247,8 @@ def run(seed: int, first: int, count: int) -> tuple[collections.Counter, list[st
     counts, faults, number, stop = collections.Counter(), [], first, first + count
     while number < stop:
         command = [sys.executable, __file__, "--worker", "--seed", str(seed), "--first",
-                   str(number), "--count", str(stop - number)]  # fmt: skip
+                   str(number), "--count", str(min(stop - number, AT_ONCE))]  # fmt: skip
+        end = min(stop, number + AT_ONCE)
         worker = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
         )
@@ -274,7 +276,7 @@ def run(seed: int, first: int, count: int) -> tuple[collections.Counter, list[st
             if number % 1000 == 0:
                 print(number, dict(counts), file=sys.stderr, flush=True)
         code = worker.wait()
-        if number < stop:
+        if number < end:
             counts["FAULT"] += 1
             faults.append(f"{last}: {what} (exit {code})")
             print(faults[-1], flush=True)

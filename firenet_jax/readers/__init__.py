@@ -66,7 +66,7 @@ def open_recording(
     names none it is inferred by reading the events once, and a notice says so.
     A file is read up to where it is damaged, and single rows that cannot be events are left out,
     at most one in a thousand; a notice says what. strict: both raise RecordingError instead.
-    columns: their order in a text without a line of names, such as "x,y,p,t".
+    columns: their order in a text or array that does not name them, such as "x,y,p,t".
     Raises RecordingError for a missing, empty, unknown or damaged file, and, when the events get
     there, for more bad rows than that.
     """
@@ -82,14 +82,14 @@ def open_recording(
     for name in FORMATS:
         module = importlib.import_module(f"{__name__}.{name}")
         if module.matches(path):
-            if columns is not None and name != "text":
-                raise RecordingError(f"{path}: is no text of events, whose columns have an order")
+            if columns is not None and name not in ("text", "npy"):
+                raise RecordingError(f"{path}: is of a format that sets the order of its columns")
             source = module.read(path) if columns is None else module.read(path, columns=columns)
             break
     else:
         raise RecordingError(
             f"{path}: not a recording of a known format: expected text or zip, an ECD or EVREAL "
-            "folder, HDF5, N-Caltech101 .bin, .dat, .raw, .aedat4, .es, or a ROS bag"
+            "folder, HDF5, .npy, .npz, N-Caltech101 .bin, .dat, .raw, .aedat4, .es, or a ROS bag"
         )
     said = 0
 

@@ -185,7 +185,10 @@ def _names(line: str) -> tuple[tuple[str, ...], float | None] | None:
     """
     known = {name: key for key, names in NAMES.items() for name in names}
     units = {name: unit for unit, names in UNITS.items() for name in names}
-    line = re.sub(r"\s*[\[(]\s*([^\s,\])]*)[^\])]*[\])]", r"|\1", line.replace('"', ""))
+    if len(line) > 1000:  # which the pattern below would take long for
+        return None
+    unit_in_brackets = r"\s*[\[(]\s*([^\s,\[\]()]*)[^\[\]()]*[\])]"
+    line = re.sub(unit_in_brackets, r"|\1", line.replace('"', ""))
     words = [word.partition("|") for word in _words(line, "," if "," in line else " ")]
     named = [known.get(name, f"_{i}") for i, (name, _, _) in enumerate(words)]
     told = {i: units.get(in_brackets) for i, (_, _, in_brackets) in enumerate(words)}
@@ -207,7 +210,11 @@ def _other_order(rows: list[list[str]]) -> str | None:
     has fractions; one alone is 0 and 1 (or -1 and 1); and they are not where they should be."""
     if len(rows) < 5 or any(len(row) != 4 or not all(map(_is_number, row)) for row in rows):
         return None
-    columns = np.array([[float(word) for word in row] for row in rows]).T
+    return other_order(np.array([[float(word) for word in row] for row in rows]).T)
+
+
+def other_order(columns: np.ndarray) -> str | None:
+    """The same of numbers (4, N)."""
     signs = [set(column.tolist()) in ({0, 1}, {-1, 1}) for column in columns]
     times = [
         (np.diff(column) >= 0).all()
