@@ -36,9 +36,11 @@ from firenet_jax.pipeline import Job, Reconstruct, in_chunks
 from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import events_to_pictures, initial_session
 from firenet_jax.video import PNG_LEVEL, FolderWriter
+from firenet_jax.windows import Windows
 
 WIDTH, HEIGHT = 240, 180
 COUNT = round(0.35 * WIDTH * HEIGHT)
+WINDOWS = Windows(events=COUNT)
 
 
 def write_text(path: Path, events: int) -> None:
@@ -75,7 +77,7 @@ def by_pytorch(recording: Path, output: Path) -> None:
 
 
 def by_us(recording: Path, output: Path) -> None:
-    pipeline.run(Reconstruct((recording,), output))
+    pipeline.run(Reconstruct((recording,), output, windows=WINDOWS))
 
 
 def stages(recording: Path, folder: Path) -> dict:
@@ -84,8 +86,8 @@ def stages(recording: Path, folder: Path) -> dict:
     weights = jax.device_put(load_weights())
 
     def reading() -> list:
-        job = Job(open_recording(recording), folder / "none", "")
-        return list(in_chunks([job], settings, slots=1, devices=1, failed={}))
+        job = Job(open_recording(recording), folder / "none", "", WINDOWS)
+        return list(in_chunks([job], settings, slots=1, devices=1, failed={}, writers={}))
 
     chunks = reading()
 

@@ -136,10 +136,11 @@ DEVICES = """
 import sys, time
 from pathlib import Path
 from firenet_jax.pipeline import Reconstruct, run
+from firenet_jax.windows import Windows
 folder, output, *where = sys.argv[1:]
 processes, process = map(int, where) if where else [None] * 2
 recordings = tuple(sorted(Path(folder).glob("*.txt")))
-choices = dict(processes=processes, process=process)
+choices = dict(processes=processes, process=process, windows=Windows(events_per_pixel=0.35))
 run(Reconstruct(recordings, Path(output, "compiling"), **choices))
 start = time.perf_counter()
 # Elsewhere: of the same output, what this process has done is not done again.

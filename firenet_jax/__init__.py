@@ -11,11 +11,14 @@
     for tensors, times in fj.event_tensors(recording, events_per_pixel=0.35):
         state, images = fj.reconstruct(weights, state, tensors)
 
+`fj.recording(t, x, y, p, width=240, height=180)` makes one of arrays.
+
 Names are loaded when they are first used (PEP 562), so importing this package loads no jax.
 No module has the name of a function here: importing the module would hide the function.
 """
 
 import importlib
+import importlib.metadata
 
 _HOME = {
     "Display": "pictures",
@@ -33,6 +36,7 @@ _HOME = {
     "normalise": "tensors",
     "open_recording": "readers",
     "pack": "tensors",
+    "recording": "arrays",
     "reconstruct": "reconstruction",
     "save_weights": "checkpoint",
     "step": "network",
@@ -44,6 +48,8 @@ __all__ = sorted(_HOME)
 
 
 def __getattr__(name: str):
+    if name == "__version__":
+        return importlib.metadata.version("firenet-jax")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)

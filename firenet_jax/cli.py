@@ -24,6 +24,25 @@ COMMANDS = {
 }
 
 
+# Options of the original program (rpg_e2vid) and what does the same here.
+FORMER = {
+    "-i": "name the recording without an option",
+    "--input_file": "name the recording without an option",
+    "--path_to_model": "-c",
+    "--auto_hdr": "--auto-range",
+    "--fixed_duration": "-T MILLISECONDS",
+    "--window_duration": "-T",
+    "--window_size": "-N",
+    "--num_events_per_pixel": "--events-per-pixel",
+    "--hot_pixels_file": "--hot-pixels",
+    "--skipevents": "--start SECONDS",
+    "--output_folder": "-o FOLDER",
+    "--bilateral_filter_sigma": "--bilateral",
+    "--unsharp_mask_amount": "--unsharp",
+    "--show_events": "--preview",
+}
+
+
 def usage() -> str:
     lines = [f"  firenet {name:13} {summary}" for name, (_, _, summary) in COMMANDS.items()]
     return "\n".join(
@@ -87,6 +106,13 @@ def main(arguments: list[str] | None = None) -> int:
     _return_freed_memory()
     name, rest = arguments[0], arguments[1:]
     module, settings, _ = COMMANDS[name]
+    for option in (word.partition("=")[0] for word in rest):
+        if name == "reconstruct" and option in FORMER:
+            print(
+                f"firenet: error: {option} is the original program's: {FORMER[option]} here",
+                file=sys.stderr,
+            )
+            return 2
     try:
         command = importlib.import_module(module)
         parsed = tyro.cli(

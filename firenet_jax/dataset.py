@@ -33,7 +33,6 @@ import h5py
 import jax
 import numpy as np
 import tyro
-from tqdm import tqdm
 
 from firenet_jax.events import Events, concatenate, parse_size
 from firenet_jax.files import (
@@ -45,6 +44,7 @@ from firenet_jax.files import (
     writing,
 )
 from firenet_jax.overlap import ahead
+from firenet_jax.progress import bar
 from firenet_jax.scenes import (
     Scene,
     SceneSettings,
@@ -370,9 +370,8 @@ def write_sequences(settings: Simulate, height: int, width: int) -> list[Path]:
             )
     missing = [entry for entry in work if not entry[0].exists()]
     events = used = 0
-    with tqdm(
-        total=len(work), initial=len(work) - len(missing), unit="seq", smoothing=0.05, disable=None
-    ) as progress:
+    there = len(work) - len(missing)
+    with bar(len(work), "seq", initial=there, smoothing=0.05) as progress:
         for done, (path, part, number) in enumerate(missing):
             if done:
                 # The first few sequences say little about the size of all.
@@ -548,7 +547,7 @@ def simulate_clip(settings: Simulate) -> Path:
 
     def renderings():
         # The sensor takes log intensity as linear between two renderings: these are the pictures.
-        with tqdm(unit="pictures", disable=None) as progress:
+        with bar(None, "pictures") as progress:
             for picture in read_clip(clip, size):
                 yield picture.time, picture.image.astype(np.float32) / 255
                 progress.update()

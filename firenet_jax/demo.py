@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 from PIL import Image, ImageDraw, ImageFont
-from tqdm import tqdm
 
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.events import parse_size
@@ -24,6 +23,7 @@ from firenet_jax.metrics import mse, ssim, temporal_error
 from firenet_jax.network import Weights, initial_state
 from firenet_jax.overlap import ahead
 from firenet_jax.pictures import Display, display, event_pictures, initial_display_state
+from firenet_jax.progress import bar
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.scenes import Scene, SceneSettings, check_seed, random_scene
 from firenet_jax.sensor import FAULTY, Sensor, SensorSettings, random_sensor, simulate
@@ -102,7 +102,7 @@ def run(settings: Demo) -> dict[str, float]:
     shown = ahead(pictures(weights, sensor, scene, count, period, height, width), depth=1)
     try:
         caption = captions(["events", "reconstruction", "truth"], width)
-        with tqdm(total=count, unit="pictures", disable=None) as progress:
+        with bar(count, "pictures") as progress:
             for number, (picture, numbers) in enumerate(shown):
                 writer.write(np.concatenate([caption, picture]), round((number + 1) * period))
                 errors += numbers if number >= warm_up else 0

@@ -56,6 +56,7 @@ from firenet_jax.files import (
 from firenet_jax.filters import check_span
 from firenet_jax.methods import NAMES, Method, Missing, digest, load
 from firenet_jax.overlap import ahead
+from firenet_jax.progress import bar
 from firenet_jax.readers import FORMATS, open_recording
 from firenet_jax.readers.hdf5 import opened
 from firenet_jax.report import METRICS
@@ -211,7 +212,7 @@ def run(settings: Evaluate) -> dict:
         work = [key for key in records if key not in done and key not in gaps]
         by_name = {method.name: method for method in methods}
         total = sum(plans[name].last for name, _ in work)
-        with tqdm(total=total, unit="frames", smoothing=0.1, disable=None) as progress:
+        with bar(total, "frames", smoothing=0.1) as progress:
             for name, method in work:
                 progress.set_postfix_str(f"{name}, {method}")
                 try:

@@ -43,8 +43,13 @@ class Events:
     @classmethod
     def of(cls, t, x, y, p) -> "Events":
         """Columns of whole numbers -> Events with the dtypes above; p: bool, 0 and 1, or -1 and 1.
-        Raises ValueError for times that are no whole microseconds."""
-        t, p = np.asarray(t), np.asarray(p)
+        Raises ValueError for columns of different lengths, and for times that are no whole
+        microseconds. What the numbers are is checked by `recording` and the readers."""
+        t, x, y, p = map(np.asarray, (t, x, y, p))
+        if not t.shape == x.shape == y.shape == p.shape:
+            raise ValueError(
+                f"columns differ in length: t {t.shape}, x {x.shape}, y {y.shape}, p {p.shape}"
+            )
         if t.dtype.kind == "f" and (t != np.rint(t)).any():
             raise ValueError("times must be whole microseconds: round 1e6 times seconds")
         return cls(
@@ -103,6 +108,8 @@ class Recording:
     events: Callable[[], Iterator[Events]]  # every call starts from the first event
     count: int | None = None  # number of events, where the file says it
     frames: Frames | None = None
+    inferred: bool = False  # whether the sensor's size is that of its events
+    grey: bool = False  # whether the file says that the sensor sees no colours
 
     @property
     def pixels(self) -> int:

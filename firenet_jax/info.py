@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from tqdm import tqdm
 
-from firenet_jax.events import RecordingError, parse_size
+from firenet_jax.events import RecordingError, counted, parse_size, until_damage
 from firenet_jax.filters import hot_pixels_of
+from firenet_jax.progress import Bytes, bar
 from firenet_jax.readers import open_recording
-from firenet_jax.windows import Windows
+from firenet_jax.windows import cut, usual
 
 
 @dataclass(frozen=True)
@@ -30,25 +30,41 @@ class Info:
     """Text, zip, HDF5, ECD or EVREAL folder, .bin, .dat, .raw, .aedat4, .es, ROS bag."""
     sensor_size: str | None = None
     """WIDTHxHEIGHT of the sensor, where the recording does not say it."""
+    columns: str | None = None
+    """Order of the columns of a text that has no line of names, such as x,y,p,t."""
     strict: bool = False
     """Refuse a recording with a bad row or damage."""
     json: bool = False
     """Print JSON instead of lines."""
 
 
-def describe(path: Path, sensor_size: tuple[int, int] | None = None, strict: bool = False) -> dict:
+def describe(
+    path: Path,
+    sensor_size: tuple[int, int] | None = None,
+    strict: bool = False,
+    columns: str | None = None,
+) -> dict:
     """Facts of a recording, in the order in which a person wants them."""
-    recording = open_recording(path, sensor_size, strict)
+    recording = open_recording(path, sensor_size, strict, columns)
+    windows = usual(until_damage(recording.events()))
     counts = np.zeros(recording.pixels, np.int64)
     on = first = last = None
-    with tqdm(total=recording.count, unit="ev", unit_scale=True, disable=None) as progress:
-        for events in recording.events():
-            pixels = events.y.astype(np.int64) * recording.width + events.x
+    read = Bytes([path] if recording.count is None else [])
+    progress = bar(recording.count or read.total, "B" if read.total else "ev", unit_scale=True)
+
+    def events():
+        nonlocal counts, on, first, last
+        for chunk in recording.events():
+            pixels = chunk.y.astype(np.int64) * recording.width + chunk.x
             counts += np.bincount(pixels, minlength=counts.size)
-            on = (on or 0) + int(events.p.sum())
-            first = int(events.t[0]) if first is None else first
-            last = int(events.t[-1])
-            progress.update(len(events))
+            on = (on or 0) + int(chunk.p.sum())
+            first = int(chunk.t[0]) if first is None else first
+            last = int(chunk.t[-1])
+            progress.update(read.read() - progress.n if read.total else len(chunk))
+            yield chunk
+
+    with progress:
+        pictures = sum(1 for _ in cut(recording, windows, events()))
     total = int(counts.sum())
     if total == 0:
         raise RecordingError(
@@ -56,12 +72,12 @@ def describe(path: Path, sensor_size: tuple[int, int] | None = None, strict: boo
         )
     hot = np.argwhere(hot_pixels_of(counts.reshape(recording.height, recording.width)))
     seconds = (last - first) / 1e6
-    window = Windows().count(recording.pixels)
     return {
         "recording": str(path),
         "format": recording.format,
         "width": recording.width,
         "height": recording.height,
+        "sensor_size_inferred": recording.inferred,
         "events": total,
         "first_event_us": first,
         "last_event_us": last,
@@ -70,30 +86,34 @@ def describe(path: Path, sensor_size: tuple[int, int] | None = None, strict: boo
         "on_share": on / total,
         "frames": 0 if recording.frames is None else len(recording.frames.times),
         "hot_pixels": [[int(x), int(y)] for y, x in hot],
-        "events_per_window": window,
-        "windows": -(-total // window),
+        "events_per_window": windows.count(recording.pixels),
+        "longest_window_ms": windows.longest,
+        "windows": pictures,
     }
 
 
 def run(settings: Info) -> None:
-    facts = describe(settings.recording, parse_size(settings.sensor_size), settings.strict)
+    facts = describe(
+        settings.recording, parse_size(settings.sensor_size), settings.strict, settings.columns
+    )
     if settings.json:
         print(json.dumps(facts, indent=2))
         return
     rate = facts["events_per_second"]
     hot = facts["hot_pixels"]
-    shown = ", ".join(f"{x},{y}" for x, y in hot[:8]) + (", ..." if len(hot) > 8 else "")
+    shown = " ".join(f"({x},{y})" for x, y in hot[:8]) + (" ..." if len(hot) > 8 else "")
     lines = {
         "format": facts["format"],
-        "sensor": f"{facts['width']}x{facts['height']} pixels",
+        "sensor": f"{facts['width']}x{facts['height']} pixels"
+        + (" (inferred from the events)" if facts["sensor_size_inferred"] else ""),
         "events": f"{facts['events']:,}",
         "duration": f"{facts['duration_s']:.6f} s, from {facts['first_event_us']} us",
         "rate": "all at one time" if rate is None else f"{rate / 1e6:.3f} million events/s",
         "polarity": f"{facts['on_share']:.1%} ON",
         "frames": f"{facts['frames']}" if facts["frames"] else "none",
-        "hot pixels": f"{len(hot)}" + (f" (x,y: {shown})" if hot else ""),
-        "window": f"{facts['events_per_window']:,} events (0.35 per pixel): "
-        f"{facts['windows']} images",
+        "hot pixels": f"{len(hot)}" + (f", (x,y): {shown}" if hot else ""),
+        "window": f"{facts['events_per_window']:,} events (0.35 per pixel), at most "
+        f"{facts['longest_window_ms']:g} ms: {counted(facts['windows'], 'image')}",
     }
     print(facts["recording"])
     for name, value in lines.items():

@@ -31,6 +31,10 @@ class Weights:
     params: Any  # nested dict of float32 arrays, kernels (3, 3, in, out)
     normalise: bool  # FireNet True, FireNet+ False
 
+    def __repr__(self) -> str:
+        count = sum(getattr(leaf, "size", 1) for leaf in jax.tree.leaves(self.params))
+        return f"Weights({count:,} parameters, normalise={self.normalise})"
+
 
 class State(NamedTuple):
     """What the network remembers between windows: the hidden maps of its two ConvGRUs."""

@@ -27,7 +27,15 @@ from tqdm import tqdm
 from firenet_jax import filters
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.devices import BATCH, EVERYWHERE, in_a_row, shared
-from firenet_jax.events import Events, Recording, RecordingError, logger, parse_size
+from firenet_jax.events import (
+    Events,
+    Recording,
+    RecordingError,
+    counted,
+    logger,
+    parse_size,
+    until_damage,
+)
 from firenet_jax.files import (
     OutputError,
     identity,
@@ -40,6 +48,7 @@ from firenet_jax.files import (
 from firenet_jax.network import Weights
 from firenet_jax.overlap import ahead
 from firenet_jax.pictures import Display
+from firenet_jax.progress import Bytes, bar
 from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import Network, Session, events_to_pictures, initial_session
 from firenet_jax.tensors import IN_LISTS, Packed, pack_for_devices
@@ -54,12 +63,12 @@ from firenet_jax.video import (
     followed,
     open_writer,
 )
-from firenet_jax.windows import Window, Windows, cut
+from firenet_jax.windows import LONGEST, Window, Windows, cut, in_words, usual
 
 # Settings that the pictures do not depend on (on the chunk only in float32's last bits), or that
 # are told in another way.
-ELSEWHERE = ("recordings", "output", "weights", "fps", "chunk", "batch", "overwrite")
-ELSEWHERE += ("processes", "process")
+ELSEWHERE = ("recordings", "output", "weights", "fps", "speed", "chunk", "batch", "overwrite")
+ELSEWHERE += ("columns", "strict", "processes", "process")
 RESUME_EVERY = 5.0  # seconds between two saves of what a resumed run needs
 
 
@@ -97,10 +106,15 @@ class Reconstruct:
     """Begin this many seconds after the first event."""
     stop: float | None = None
     """End this many seconds after the first event."""
-    fps: float = 30.0
-    """Pictures per second of a video (windows of events have no rate of their own)."""
+    speed: float | None = None
+    """How fast a video plays: 1 is real time, 0.1 ten times slower. Without: real time, and slower
+    where a recording is so short that nobody could see it."""
+    fps: float | None = None
+    """Show each picture of a video for as long, so many per second, whatever its time."""
     sensor_size: str | None = None
     """WIDTHxHEIGHT of the sensor, such as 240x180, where the recording does not say it."""
+    columns: str | None = None
+    """Order of the columns of a text that has no line of names, such as x,y,p,t."""
     strict: bool = False
     """Refuse a recording with a bad row or damage, instead of leaving out what cannot be read (at
     most one event in a thousand) and reading up to the damage."""
@@ -117,7 +131,12 @@ class Reconstruct:
     """Which one this is, from 0."""
 
     def __post_init__(self):
-        check_rate(self.output, self.fps)
+        if self.fps is not None:
+            check_rate(self.output, self.fps)
+            if self.speed is not None:
+                raise ValueError("fps and speed: a video has one or the other, leave one out")
+        if self.speed is not None and not 1e-6 <= self.speed <= 1e6:
+            raise ValueError(f"speed is {self.speed}, but must be more than 0; 1 is real time")
         for name in ("chunk", "batch"):
             value = getattr(self, name)
             if value is not None and not value > 0:
@@ -139,6 +158,8 @@ class Job(NamedTuple):
     recording: Recording
     output: Path
     record: str  # JSON of all that the pictures depend on; a resumed run must have the same
+    windows: Windows = Windows()  # as asked for, or as they suit the recording
+    speed: float = 1.0  # at which a video plays
 
 
 @dataclass
@@ -149,6 +170,7 @@ class Running:
     windows: Iterator[Window]
     ahead: Window | None  # the next window; None after the last
     reached: int  # windows taken so far, those of an earlier run among them
+    events: list[int]  # how many were read so far
     writer: FolderWriter | VideoWriter
     error: RecordingError | None = None  # that ended its windows before their time
 
@@ -203,39 +225,95 @@ def run(settings: Reconstruct) -> list[Path]:
     size = parse_size(settings.sensor_size)
     jobs = []
     for path, output in zip(settings.recordings[mine], outputs, strict=True):
-        recording = open_recording(path, size, settings.strict)
-        job = Job(recording, output, describe(settings, recording, weights))
+        recording = open_recording(path, size, settings.strict, settings.columns)
+        if settings.network.color and recording.grey:
+            raise RecordingError(
+                f"{path}: says that its sensor sees no colours, --color would invent some: leave "
+                "it out"
+            )
+        windows, speed = windows_for(recording, settings)
+        chosen = dataclasses.replace(settings, windows=windows)
+        job = Job(recording, output, describe(chosen, recording, weights), windows, speed)
         if is_done(job):
             logger.warning("%s: done by the run that this one continues", output)
             continue
         check_output(output, settings.overwrite)
         check_position(job, settings)
         jobs.append(job)
+    began, failed, said = time.monotonic(), {}, {}
     counts = [job.recording.count for job in jobs]
     partly = settings.start or settings.stop or settings.windows.step
     known = None if None in counts or partly else sum(counts)
-    began, failed = time.monotonic(), {}
-    with tqdm(total=known, unit="ev", unit_scale=True, smoothing=0.1, disable=None) as progress:
-        total = [
-            reconstruct_jobs(same, settings, weights, progress, failed)
-            for same in by_sensor_size(jobs)
-        ]
+    read = Bytes([job.recording.path for job in jobs] if known is None else [])
+    unit = "ev" if known or read.total is None else "B"
+    with bar(known or read.total, unit, unit_scale=True, smoothing=0.1) as progress:
+        for same in by_sensor_size(jobs):
+            reconstruct_jobs(same, settings, weights, progress, failed, said, read)
     seconds = time.monotonic() - began
-    shown, events = (sum(column) for column in zip((0, 0), *total, strict=True))
-    done = [job.output for job in jobs if job.output not in failed]
-    if done:
-        rates = f"{shown / seconds:.1f} pictures/s, {events / seconds / 1e6:.2f} Mev/s"
-        print(
-            f"{', '.join(map(str, done))}: {shown} pictures of {events:,} events in "
-            f"{seconds:.1f} s ({rates})"
-        )
+    if said:
+        print(closing_line(said, {job.output: job for job in jobs}, seconds))
     if failed:
-        rest = "; the other recordings are done" if done else ""
+        rest = "; the other recordings are done" if said else ""
         raise RecordingError("; ".join(map(str, failed.values())) + rest)
     if all(done_file(output).is_file() for output in planned):  # those of other processes too
         for output in planned:
             done_file(output).unlink(missing_ok=True)
     return outputs
+
+
+def windows_for(recording: Recording, settings: Reconstruct) -> tuple[Windows, float]:
+    """The windows, and the speed of a video: those asked for, or what suits the recording."""
+    windows, speed = settings.windows, settings.speed or 1.0
+    if windows == Windows():
+        chunks = recording.events()
+        if settings.start is not None or settings.stop is not None:
+            chunks = filters.between(chunks, settings.start, settings.stop)
+        try:
+            windows = usual(until_damage(chunks))
+        except RecordingError:  # told when its events are read, so that others are done
+            windows = Windows(longest=LONGEST)
+        if settings.speed is None and windows.longest < LONGEST / 2:  # gone in 0.4 s
+            speed = windows.longest / LONGEST
+    return windows, speed
+
+
+class Said(NamedTuple):
+    """What the closing line tells of an output."""
+
+    pictures: int
+    events: int
+    slower: float | None  # than reality, of a video
+
+
+def closing_line(said: dict[Path, Said], jobs: dict[Path, Job], seconds: float) -> str:
+    """ "video.mp4: 59 pictures of 78,830 events in 15.0 s (...), windows of ...; in real time" """
+    pictures, events = (sum(column) for column in list(zip(*said.values(), strict=True))[:2])
+    ways = {in_words(jobs[output].windows, jobs[output].recording.pixels) for output in said}
+    if len(ways) > 1:
+        ways = {"windows as they suit each recording"}
+    factors = [entry.slower for entry in said.values() if entry.slower is not None]
+    plays = ""
+    if factors:
+        least, most = min(factors), max(factors)
+        plays = f"; plays {factor_in_words(least)}"
+        if factor_in_words(most) != factor_in_words(least):
+            plays += f" to {factor_in_words(most)}"
+    rates = f"{pictures / seconds:.1f} pictures/s, {rate_in_words(events / seconds)}"
+    return (
+        f"{', '.join(map(str, said))}: {counted(pictures, 'picture')} of "
+        f"{counted(events, 'event')} in {seconds:.1f} s ({rates}); {', '.join(ways)}{plays}"
+    )
+
+
+def rate_in_words(rate: float) -> str:
+    """ "2.31 Mev/s", "46.2 kev/s" """
+    return f"{rate / 1e6:.2f} Mev/s" if rate >= 1e6 else f"{rate / 1e3:.3g} kev/s"
+
+
+def factor_in_words(slower: float) -> str:
+    if 0.98 < slower < 1.02:
+        return "in real time"
+    return f"{slower:.3g} times slower" if slower > 1 else f"{1 / slower:.3g} times faster"
 
 
 def plan(recordings: tuple[Path, ...], output: Path) -> list[Path]:
@@ -296,8 +374,10 @@ def reconstruct_jobs(
     weights: Weights,
     progress: tqdm,
     failed: dict[Path, RecordingError],
-) -> tuple[int, int]:
-    """Jobs of one sensor size -> their outputs on disk; returns (pictures, events) done.
+    said: dict[Path, Said],
+    read: Bytes,
+) -> None:
+    """Jobs of one sensor size -> their outputs on disk; what is to be told of each goes to `said`.
 
     A recording that turns out to be damaged does not keep the others from being done: its error
     goes to `failed`, by its output.
@@ -352,7 +432,7 @@ def reconstruct_jobs(
             keep_position(chunk.parts[slot], state)
         return chunk, jax.device_get(shown)
 
-    pictures_done = events_done = 0
+    pictures_done: dict[Path, int] = {}
     finished = ahead(device(), depth=1)
     try:
         for chunk, shown in finished:
@@ -360,12 +440,12 @@ def reconstruct_jobs(
                 running, times = part.running, part.times
                 for picture, time_of in zip(shown[:, slot], times, strict=False):
                     running.writer.write(picture, time_of)
-                pictures_done += len(times)
+                output = running.job.output
+                pictures_done[output] = pictures_done.get(output, 0) + len(times)
                 if part.ends and running.error:
                     failed[running.job.output] = running.error
                     writers.pop(running.job.output).abandon()
                 elif part.ends:
-                    output = running.job.output
                     done_file(output).unlink(missing_ok=True)
                     running.writer.finish()
                     if isinstance(running.writer, FolderWriter):
@@ -373,17 +453,20 @@ def reconstruct_jobs(
                     if len(settings.recordings) > 1:
                         write_text(done_file(output), done_as(running.job))
                     del writers[output]
+                    said[output] = Said(
+                        pictures_done[output],
+                        sum(running.events),
+                        getattr(running.writer, "slower", None),
+                    )
                 else:
                     publish_position(part)
-            events_done += chunk.count
-            progress.update(chunk.count)
-            progress.set_postfix_str(f"{pictures_done} pictures", refresh=False)
+            progress.set_postfix_str(counted(sum(pictures_done.values()), "picture"), refresh=False)
+            progress.update(read.read() - progress.n if read.total else chunk.count)
     finally:
         finished.close()
         chunks.close()  # else its thread would live as long as an exception that holds this frame
         for writer in writers.values():
             writer.abandon()
-    return pictures_done, events_done
 
 
 @jax.jit
@@ -453,27 +536,47 @@ def start(
 ) -> tuple[Running, Session]:
     """Opens the stream of a job's windows, after those that an interrupted run has finished."""
     # First of all, as it keeps other runs from what is read and removed here.
-    writer = writers[job.output] = open_writer(job.output, settings.fps)
+    writer = writers[job.output] = open_writer(job.output, settings.fps, job.speed)
     try:
         recording = job.recording
-        chunks = recording.events()
+        span: list[int] = []
+        chunks = timed(recording.events(), span)
         if settings.start is not None or settings.stop is not None:
             chunks = filters.between(chunks, settings.start, settings.stop)
         if settings.hot_pixels is not None:
             chunks = filters.without(chunks, hot_pixels(settings.hot_pixels, recording))
         if settings.flip:
             chunks = filters.turned(chunks, recording.height, recording.width)
-        windows = cut(recording, settings.windows, chunks)
+        events: list[int] = []
+        windows = cut(recording, job.windows, numbered(chunks, events))
         done, session = load_position(job, settings)
         first = next(itertools.islice(windows, done, None), None)
         if first is None and not done:
-            raise RecordingError(f"{recording.path}: no events, or none that the filters let pass")
+            lasts = f": it lasts {(span[1] - span[0]) / 1e6:g} s" if span else ""
+            raise RecordingError(
+                f"{recording.path}: no events, or none that the filters let pass{lasts}"
+            )
     except RecordingError:
         writers.pop(job.output).abandon()
         raise
     if done:
         writer.keep(done)
-    return Running(job, windows, first, done, writer), session
+        events.clear()  # those of the pictures that are there
+    return Running(job, windows, first, done, events, writer), session
+
+
+def timed(chunks: Iterator[Events], span: list[int]) -> Iterator[Events]:
+    """The same chunks; the times of the first event and of the last go to `span`."""
+    for chunk in chunks:
+        span[:] = [span[0] if span else int(chunk.t[0]), int(chunk.t[-1])]
+        yield chunk
+
+
+def numbered(chunks: Iterator[Events], counts: list[int]) -> Iterator[Events]:
+    """The same chunks; how many events each holds goes to `counts`."""
+    for chunk in chunks:
+        counts.append(len(chunk))
+        yield chunk
 
 
 def hot_pixels(choice: str, recording: Recording) -> np.ndarray:
@@ -497,7 +600,7 @@ def describe(settings: Reconstruct, recording: Recording, weights: Weights) -> s
         hot = hot_pixels(settings.hot_pixels, recording)
         choices["hot_pixels"] = hashlib.sha256(hot.tobytes()).hexdigest()
     if settings.output.suffix in VIDEOS:
-        choices["fps"] = settings.fps
+        choices |= {"fps": settings.fps, "speed": settings.speed}
     return json.dumps(
         {
             "recording": identity(recording.path),

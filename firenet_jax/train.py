@@ -45,7 +45,6 @@ import tyro
 from jax.experimental import multihost_utils
 from PIL import Image
 from tensorboardX import SummaryWriter
-from tqdm import tqdm
 
 from firenet_jax import metrics
 from firenet_jax.batches import NOTHING, Augment, batches, split
@@ -72,6 +71,7 @@ from firenet_jax.network import (
     step,
 )
 from firenet_jax.pictures import event_pictures
+from firenet_jax.progress import bar
 from firenet_jax.scenes import SceneSettings, check_range, check_seed
 from firenet_jax.sensor import (
     FAULTY,
@@ -502,7 +502,7 @@ def run(settings: Train, stop: int | None = None) -> None:
         best, last_save = log.best(), time.monotonic()
         last = min(settings.steps, stop or settings.steps)
         with (
-            tqdm(total=last, initial=done, unit="step", disable=_bar()) as progress,
+            bar(last, "step", quiet=not _first(), initial=done) as progress,
             _interruptible() as interrupted,
         ):
             while done < last and not interrupted:
@@ -569,11 +569,6 @@ def _due(last_save: float, settings: Train) -> bool:
 def _first() -> bool:
     """Whether this is the process that writes and talks."""
     return jax.process_index() == 0
-
-
-def _bar() -> bool | None:
-    """tqdm's `disable`: no bar but in the first process, and there none where nobody looks."""
-    return None if _first() else True
 
 
 def sources_of(settings: Train, done: int) -> tuple[Iterator, list[Callable[[], Simulation]]]:

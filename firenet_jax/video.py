@@ -28,9 +28,12 @@ OTHER_FILES = (
     ".txt", ".csv", ".json", ".raw", ".dat", ".bin", ".es", ".aedat", ".aedat4",
     ".bag", ".db3", ".mcap",
 )  # fmt: skip
+LIKE_A_FILE = re.compile(r"\.[A-Za-z][A-Za-z0-9]{2,4}")  # nor is any other such ending
 OURS = re.compile(r"timestamps\.txt|resume[.\w]*\.npz|frame_\d{10,}\.png")  # in a folder
 RATES = 0.01, 10_000  # pictures per second
 GIF_RATE = 100  # pictures per second, the most that the format can say
+MP4_CLOCK = 90_000  # ticks per second, as is usual
+USUAL_RATE = 30  # pictures per second, for what an encoder wants to know
 PNG_LEVEL = 4  # on grey pictures 25 % faster than the default 6, files 2 % larger
 
 
@@ -59,7 +62,9 @@ def check_rate(path: Path, fps: float) -> None:
 
 def check_output(path: Path, overwrite: bool) -> None:
     """Raises OutputError if something is at the final name that must not or cannot be replaced."""
-    if path.suffix.lower() in (*VIDEOS, *OTHER_FILES) and path.suffix not in VIDEOS:
+    other = path.suffix.lower() in (*VIDEOS, *OTHER_FILES)
+    other |= LIKE_A_FILE.fullmatch(path.suffix) is not None and not path.is_dir()
+    if other and path.suffix not in VIDEOS:
         raise OutputError(
             f"{path}: cannot write {path.suffix} files: name a folder (for png), .mp4 or .gif"
         )
@@ -180,11 +185,23 @@ class FolderWriter:
 
 
 class VideoWriter:
-    """Pictures -> mp4 (H.264) or gif, all of one size."""
+    """Pictures -> mp4 (H.264) or gif, all of one size.
 
-    def __init__(self, path: Path, fps: float):
+    With `fps` each is shown for as long; without, from its time on to that of the next, `speed`
+    times as fast. (Not closer to each other than the format can tell.)
+    """
+
+    def __init__(self, path: Path, fps: float | None, speed: float = 1.0):
         self.path, self.partial = path, partial_name(path)
-        self.rate = Fraction(fps).limit_denominator(1000)
+        self.rate = Fraction(fps or USUAL_RATE).limit_denominator(1000)
+        self.tick, self.least = 1 / self.rate, 1  # seconds; ticks between two pictures
+        if fps is None:
+            gif = path.suffix == ".gif"
+            self.tick = Fraction(1, GIF_RATE if gif else MP4_CLOCK)
+            self.least = 2 if gif else MP4_CLOCK // 1000
+        self.speed, self.timed = speed, fps is None
+        self.first = self.last = 0  # times of pictures, microseconds
+        self.at = -1  # ticks, where the last picture is
         self.count = 0
         with writing(path):
             self.held = self.partial.open("ab")
@@ -196,12 +213,19 @@ class VideoWriter:
         if self.path.suffix == ".gif":
             self.stream = self.container.add_stream("gif", rate=self.rate)
             self.stream.pix_fmt = "pal8"
-            self.filter = _palette_filter(height, width, self.rate)
+            self.filter = _palette_filter(height, width, self.tick)
         else:
             self.stream = self.container.add_stream("libx264", rate=self.rate)
             self.stream.pix_fmt = "yuv420p"  # what every player can show
             self.stream.options = {"crf": "18", "preset": "veryfast"}
         self.stream.height, self.stream.width = height, width
+        self.stream.codec_context.time_base = self.tick
+
+    @property
+    def slower(self) -> float | None:
+        """How many times slower than in reality it plays; None of a single moment."""
+        played, real = float(self.at * self.tick), (self.last - self.first) / 1e6
+        return played / real if played > 0 and real > 0 else None
 
     def write(self, picture: np.ndarray, time: int = 0) -> None:
         if self.path.suffix == ".mp4":  # chroma at half the size wants even sides
@@ -214,7 +238,11 @@ class VideoWriter:
             picture = np.stack([picture] * 3, -1) if picture.ndim == 2 else picture
             layout = "rgb24"
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=layout)
-        frame.pts, frame.time_base = self.count, 1 / self.rate
+        self.first, self.last = (time if self.at < 0 else self.first), time
+        since = Fraction((time - self.first) / self.speed / 1e6) / self.tick
+        self.at = max(self.at + self.least, round(since)) if self.timed else self.count
+        frame.pts, frame.time_base = (0 if self.count == 0 else self.at), self.tick
+        self.at = frame.pts
         self.count += 1
         if self.filter:
             self.filter.vpush(frame)
@@ -242,10 +270,10 @@ class VideoWriter:
         self.held.close()
 
 
-def _palette_filter(height: int, width: int, rate: Fraction) -> av.filter.Graph:
+def _palette_filter(height: int, width: int, tick: Fraction) -> av.filter.Graph:
     """A filter graph that gives every gif picture the 256 colours that suit it best."""
     graph = av.filter.Graph()
-    source = graph.add_buffer(width=width, height=height, format="rgb24", time_base=1 / rate)
+    source = graph.add_buffer(width=width, height=height, format="rgb24", time_base=tick)
     split = graph.add("split")
     palette = graph.add("palettegen", "stats_mode=single")
     use = graph.add("paletteuse", "new=1:dither=none")
@@ -259,10 +287,15 @@ def _palette_filter(height: int, width: int, rate: Fraction) -> av.filter.Graph:
     return graph
 
 
-def open_writer(path: Path, fps: float) -> FolderWriter | VideoWriter:
-    """Raises OutputError for a rate that the output cannot show, or where another run writes it."""
-    check_rate(path, fps)
-    return VideoWriter(path, fps) if path.suffix in VIDEOS else FolderWriter(path)
+def open_writer(
+    path: Path, fps: float | None = None, speed: float = 1.0
+) -> FolderWriter | VideoWriter:
+    """fps, speed: of a video, as `VideoWriter` takes them.
+
+    Raises OutputError for a rate that the output cannot show, or where another run writes it."""
+    if fps is not None:
+        check_rate(path, fps)
+    return VideoWriter(path, fps, speed) if path.suffix in VIDEOS else FolderWriter(path)
 
 
 def write_video(path: str | Path, pictures: Iterable[np.ndarray], fps: float = 30) -> None:

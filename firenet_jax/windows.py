@@ -14,10 +14,19 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import tyro
 
-from firenet_jax.events import Events, Recording, RecordingError, concatenate, logger
+from firenet_jax.events import (
+    Events,
+    Recording,
+    RecordingError,
+    concatenate,
+    counted,
+    logger,
+)
 
 APART = 3_600_000_000  # microseconds between events of one clock, or events and frames, at most
 MOST = 2**31 - 1
+LONGEST = 40.0  # milliseconds of a window where none are chosen: 25 pictures per second at least
+PICTURES = 20  # of a recording that is too short for so many of these, at least
 
 
 class Window(NamedTuple):
@@ -42,6 +51,9 @@ class Windows:
     step: float | None = None
     """Windows start this far apart, in events (or ms, with --duration): less than the window
     makes them overlap."""
+    longest: float | None = None
+    """A window of events ends after so many milliseconds at the latest. Where no way to cut is
+    chosen: 40, or a twentieth of a recording that is shorter than 0.8 s."""
 
     def __post_init__(self):
         ways = [self.events, self.events_per_pixel, self.duration, self.between_frames or None]
@@ -50,7 +62,7 @@ class Windows:
                 "windows are cut in one way: choose one of --events, --events-per-pixel, "
                 "--duration and --between-frames"
             )
-        for name in ("events", "events_per_pixel", "duration", "step"):
+        for name in ("events", "events_per_pixel", "duration", "step", "longest"):
             value = getattr(self, name)
             if value is not None and not 0 < value <= MOST:
                 raise ValueError(f"{name} is {value}, but must be more than 0, at most {MOST}")
@@ -61,6 +73,11 @@ class Windows:
                 raise ValueError(f"step is {self.step}, but counts events: pass a whole number")
             if self.duration is not None and round(self.step * 1000) < 1:
                 raise ValueError(f"step is {self.step} ms, but times are whole microseconds")
+        if self.longest is not None:
+            if self.duration is not None or self.between_frames or self.step is not None:
+                raise ValueError("longest limits windows of events, which do not overlap")
+            if round(self.longest * 1000) < 1:
+                raise ValueError(f"longest is {self.longest} ms, but times are whole microseconds")
         if self.duration is not None and round(self.duration * 1000) < 1:
             raise ValueError(f"duration is {self.duration} ms, but times are whole microseconds")
 
@@ -71,6 +88,35 @@ class Windows:
         if self.events is not None:
             return self.events
         return max(1, round((self.events_per_pixel or 0.35) * pixels))
+
+
+def usual(chunks: Iterable[Events]) -> Windows:
+    """The windows of a recording for which none are chosen: 0.35 events per pixel, but at most
+    40 ms, so that where little moves there still is a picture; of a recording shorter than 20 of
+    these, a twentieth of it. Reads that much of it."""
+    first = last = None
+    for events in chunks:
+        first = int(events.t[0]) if first is None else first
+        last = int(events.t[-1])
+        if last - first >= PICTURES * 1000 * LONGEST:
+            return Windows(longest=LONGEST)
+    return Windows(longest=max(((last or 0) - (first or 0)) // PICTURES, 1) / 1000)
+
+
+def in_words(windows: Windows, pixels: int) -> str:
+    """ "windows of 0.35 events per pixel (15,120), at most 40 ms" """
+    count = windows.count(pixels)
+    if windows.between_frames:
+        said = "windows between frames"
+    elif windows.duration is not None:
+        said = f"windows of {windows.duration:g} ms"
+    elif windows.events is not None:
+        said = f"windows of {counted(count, 'event')}"
+    else:
+        said = f"windows of {windows.events_per_pixel or 0.35:g} events per pixel ({count:,})"
+    if windows.step is not None:
+        said += f", one every {windows.step:g} {'ms' if windows.duration else 'events'}"
+    return said + ("" if windows.longest is None else f", at most {windows.longest:g} ms")
 
 
 def cut(
@@ -108,6 +154,8 @@ def cut(
     if step > count:
         raise ValueError(f"step of {step} events is longer than the window, {count} events")
     warn_if_unusual(count, recording.pixels)
+    if windows.longest is not None:
+        return _by_count_or_time(chunks, count, round(1000 * windows.longest))
     return _by_count(chunks, count, step)
 
 
@@ -116,9 +164,9 @@ def warn_if_unusual(events: float, pixels: int) -> None:
     density = events / pixels
     if not 0.1 <= density <= 1.5:
         logger.warning(
-            "%d events per window are %.3g per pixel: fewer than 0.1 give noisy and faint images, "
+            "%d events per window are %s per pixel: fewer than 0.1 give noisy and faint images, "
             "more than 1.5 smeared ones; 0.35 (%d events) is usual for this sensor",
-            events, density, round(0.35 * pixels),
+            events, f"{density:,.0f}" if density >= 100 else f"{density:.3g}", round(0.35 * pixels),
         )  # fmt: skip
 
 
@@ -138,6 +186,24 @@ def _by_count(chunks: Iterator[Events], count: int, step: int) -> Iterator[Windo
         held, size, covered = [events.select(slice(start, None))], size - start, covered - start
     if size > max(covered, 0):
         yield _window(concatenate(held), 0, size)
+
+
+def _by_count_or_time(chunks: Iterator[Events], count: int, longest: int) -> Iterator[Window]:
+    """Windows that end with their event number `count`, or before an event that comes `longest`
+    microseconds after their first one or later. None is empty."""
+    held = Events.empty()
+    for chunk in chunks:
+        held, start = concatenate([held, chunk]) if len(held) else chunk, 0
+        while start < len(held):
+            stop = int(np.searchsorted(held.t, held.t[start] + longest))
+            if min(stop, start + count) >= len(held) and stop - start < count:
+                break  # it may go on in the next chunk
+            stop = min(stop, start + count)
+            yield _window(held, start, stop)
+            start = stop
+        held = held.select(slice(start, None))
+    if len(held):
+        yield _window(held, 0, len(held))
 
 
 def _by_time(path, chunks: Iterator[Events], begin: int | None, spans) -> Iterator[Window]:

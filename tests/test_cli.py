@@ -92,7 +92,17 @@ def test_info_as_lines_and_as_json(here, capsys):
     assert facts["events"] == 500 and (facts["width"], facts["height"]) == (24, 20)
     assert facts["duration_s"] == pytest.approx(np.ptp(rows[:, 0]))
     assert facts["on_share"] == pytest.approx(rows[:, 3].mean())
-    assert facts["events_per_window"] == 168 and facts["windows"] == 3
+    assert facts["events_per_window"] == 168 and not facts["sensor_size_inferred"]
+    begin, count, windows = rows[0, 0], 0, 1  # at most 40 ms and 168 events
+    for t in rows[:, 0]:
+        if round(1e6 * (t - begin)) >= 40_000 or count == 168:
+            begin, count, windows = t, 0, windows + 1
+        count += 1
+    assert facts["windows"] == windows and facts["longest_window_ms"] == 40
+    (here / "none.txt").write_text("0.1 3 4 1\n0.2 20 11 0\n")
+    facts = json.loads(firenet(capsys, "info none.txt --json")[1])
+    assert (facts["width"], facts["height"], facts["sensor_size_inferred"]) == (21, 12, True)
+    assert "21x12 pixels (inferred from the events)" in firenet(capsys, "info none.txt")[1]
 
 
 def test_convert_needs_no_pytorch_and_says_what_it_did(here, capsys, reference):
@@ -225,4 +235,22 @@ def test_info_names_hot_pixels_by_column_and_row(here, capsys):
     rows = [f"{k / 1e4:.4f} {k % 24} {k // 24 % 20} 1" for k in range(480)]
     text_with(here / "hot.txt", [*rows, *["0.5 17 4 1"] * 400])
     assert json.loads(firenet(capsys, "info hot.txt --json")[1])["hot_pixels"] == [[17, 4]]
-    assert "1 (x,y: 17,4)" in firenet(capsys, "info hot.txt")[1]
+    assert "1, (x,y): (17,4)" in firenet(capsys, "info hot.txt")[1]
+
+
+def test_options_of_the_original_program_are_explained(here, capsys):
+    for line, said in (("-i a.txt -o out", "-i is"), (f"{RUN} --auto_hdr", "--auto-range here")):
+        line = line if line.startswith("reconstruct") else f"reconstruct {line}"
+        code, _, error = firenet(capsys, line)
+        assert code == 2 and said in error and len(error.splitlines()) == 1
+    code, _, error = firenet(capsys, f"{RUN} --start 5")
+    assert code == 1 and re.search(r"a.txt: no events, .*: it lasts 0\.9\d+ s", error)
+    code, _, error = firenet(capsys, "reconstruct a.txt -o x.txt2 -c weights.npz")
+    assert code == 1 and "cannot write .txt2 files" in error
+
+
+def test_colours_of_a_sensor_that_says_it_is_grey(here, capsys):
+    words = np.array([[10, 1 | 2 << 14], [20, 3 | 4 << 14]], "<u4").tobytes()
+    (here / "a.dat").write_bytes(b"% Version 2\n% Width 24\n% Height 20\n\x00\x08" + words)
+    code, _, error = firenet(capsys, "reconstruct a.dat -o out -c weights.npz --color")
+    assert code == 1 and "sees no colours" in error and not list(here.glob("out*"))

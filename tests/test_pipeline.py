@@ -7,6 +7,7 @@ import textwrap
 import threading
 from pathlib import Path
 
+import av
 import jax
 import numpy as np
 import pytest
@@ -554,3 +555,38 @@ def test_a_second_run_into_a_folder_touches_nothing(tmp_path, weights, monkeypat
     assert (tmp_path / "out.partial.mp4").read_bytes() == b"half"
     run(settings(weights, (recording,), out))
     assert len(list(out.glob("*.png"))) == 30 and not partial.exists()
+
+
+def test_a_short_recording_is_a_video_and_the_closing_line_says_how(tmp_path, weights, capsys):
+    """0.1 s and 90 events, fewer than a window of 0.35 per pixel: 168."""
+    text = write_recording(tmp_path / "a.txt", 90).read_text().splitlines()
+    rows = [f"{float(line.split()[0]) / 10:.6f} {line.split(maxsplit=1)[1]}" for line in text[1:]]
+    (tmp_path / "a.txt").write_text("\n".join([text[0], *rows]) + "\n")
+    run(settings(weights, (tmp_path / "a.txt",), tmp_path / "a.mp4", windows=Windows()))
+    said = capsys.readouterr().out
+    longest = int(1e6 * (float(rows[-1].split()[0]) - float(rows[0].split()[0]))) // 20 / 1000
+    assert "of 90 events in" in said
+    assert f"windows of 0.35 events per pixel (168), at most {longest:g} ms" in said
+    factor = round(40 / longest, 1)
+    assert f"; plays {factor:g}" in said and "times slower" in said
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert 15 <= len(list(container.decode(video=0))) <= 21
+
+
+def test_real_time_is_the_default_and_each_event_is_counted_once(tmp_path, weights, capsys):
+    recording = write_recording(tmp_path / "a.txt")
+    for choice, said in (
+        ({}, "; windows of 50 ms, one every 25 ms; plays in real time"),
+        ({"speed": 0.5}, "plays 2 times slower"),
+        ({"speed": 4.0}, "plays 4 times faster"),
+        ({"fps": 10.0}, "plays 4 times slower"),
+    ):
+        windows = Windows(duration=50, step=25)
+        run(settings(weights, (recording,), tmp_path / "a.mp4", windows=windows, overwrite=True,
+                     **choice))  # fmt: skip
+        line = capsys.readouterr().out
+        assert said in line and "of 3,000 events" in line and "Mev/s" not in line
+    with pytest.raises(ValueError, match="fps and speed"):
+        settings(weights, (recording,), tmp_path / "a.mp4", fps=5.0, speed=1.0)
+    run(settings(weights, (recording,), tmp_path / "one", windows=Windows(events=3000)))
+    assert "1 picture of 3,000 events" in capsys.readouterr().out

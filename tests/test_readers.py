@@ -1271,3 +1271,101 @@ def test_more_than_one_in_a_thousand_is_an_error_wherever_it_comes(tmp_path):
     assert len(events_of(recording(0, 1500, 2999), None)) == 2997
     with pytest.raises(RecordingError, match="line 2: x is 400, outside the sensor of 320x240"):
         events_of(recording(0, 1500, 2998, 2999), None)
+
+
+# ---------------------------------------------------------------- what a new user meets
+
+
+@pytest.mark.parametrize("order", ["x,y,p,t", "p,t,x,y", "x,y,t,p", "t,p,x,y"])
+@pytest.mark.parametrize("seconds", [True, False])
+def test_columns_in_another_order_are_asked_for(tmp_path, order, seconds):
+    t = [f"{1 + i * 0.001:.6f}" if seconds else f"{10**6 + 1000 * i}" for i in range(50)]
+    x, y, p = (
+        [str((i * step) % size) for i in range(50)] for step, size in ((7, 300), (5, 30), (1, 2))
+    )
+    values = {"t": t, "x": x, "y": y, "p": p}
+    rows = [",".join(row) for row in zip(*(values[key] for key in order.split(",")), strict=True)]
+    path = write(tmp_path / "a.csv", "\n".join(rows))
+    refused(path, f"columns look like {order}, not t,x,y,p: pass --columns {order}")
+    events = concatenate(list(open_recording(path, (240, 320), columns=order).events()))
+    np.testing.assert_array_equal(events.t, 10**6 + 1000 * np.arange(50))
+    assert events.x.tolist() == [*map(int, x)] and events.y.tolist() == [*map(int, y)]
+    with pytest.raises(RecordingError, match="columns are 'x,y', expected an order"):
+        open_recording(path, columns="x,y")
+
+
+def test_which_recordings_say_that_they_are_grey(recordings):
+    for name, grey in (("davis346_frames.aedat4", True), ("dvxplorer_face.aedat4", True),
+                       ("ncars.dat", True), ("ecd_slider_depth", False)):  # fmt: skip
+        assert open_recording(recordings / name).grey is grey
+
+
+# ---------------------------------------------------------------- one file of numpy; more of HDF5
+
+
+@pytest.mark.parametrize("kind", ["rows", "seconds", "structured", "named", "npz"])
+def test_one_file_of_numpy(tmp_path, kind):
+    path = tmp_path / ("a.npz" if kind in ("named", "npz") else "a.npy")
+    columns = {"t": T, "x": X, "y": Y, "p": P}
+    rows = np.stack([*columns.values()], 1)
+    if kind == "rows":
+        np.save(path, rows)
+    elif kind == "seconds":
+        np.save(path, rows * [1e-6, 1, 1, 1])
+    elif kind == "structured":
+        array = np.zeros(len(T), [("x", "u2"), ("y", "u2"), ("polarity", "?"), ("timestamp", "i8")])
+        for name, column in zip(("timestamp", "x", "y", "polarity"), columns.values(), strict=True):
+            array[name] = column
+        np.save(path, array)
+    elif kind == "named":
+        np.savez(path, **{f"{name}s": column for name, column in columns.items()})
+    else:
+        np.savez_compressed(path, events=rows)
+    check(path)
+    assert open_recording(path).count == len(T)
+
+
+def test_wrong_files_of_numpy(tmp_path):
+    path = tmp_path / "a.npy"
+    np.save(path, np.zeros((5, 3)))
+    refused(path, "float64 of shape (5, 3), expected rows (N, 4)")
+    np.save(path, np.stack([X, Y, P, T], 1)[[0, 1, 2, 3, 4, 4]])
+    refused(path, "columns look like x,y,p,t, not t,x,y,p: pass --columns x,y,p,t")
+    np.testing.assert_array_equal(
+        next(open_recording(path, (240, 320), columns="x,y,p,t").events()).t[:5], T
+    )
+    np.savez(tmp_path / "a.npz", t=T, x=X, y=Y[:2], p=P)
+    refused(tmp_path / "a.npz", "columns of one length")
+    np.savez(tmp_path / "a.npz", t=T, x=X)
+    refused(tmp_path / "a.npz", "holds 't', 'x', expected t, x, y and p")
+    np.savez(tmp_path / "a.npz", events=np.array([print], object))
+    refused(tmp_path / "a.npz", "cannot be read")
+    write(path, b"\x93NUMPY no header")
+    refused(path, "cannot be read")
+
+
+def test_hdf5_of_v2e_and_of_metavision(tmp_path):
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["events"] = np.stack([T, X, Y, P], 1).astype(np.uint32)
+    check(path)
+    assert open_recording(path, (240, 320)).format == "HDF5 (v2e)"
+    with h5py.File(path, "w") as file:
+        rows = np.zeros(len(T), [("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
+        for name, column in (("x", X), ("y", Y), ("p", P), ("t", T)):
+            rows[name] = column
+        file["CD/events"] = rows
+        file.attrs["geometry"] = "320x240"
+    check(path, size=None)
+    with h5py.File(path, "w") as file:
+        file["events"] = np.zeros((5, 3))
+    refused(path, "events has the shape (5, 3), expected (N, 4)")
+    with h5py.File(path, "w") as file:
+        file["CD/events"] = np.zeros(5)
+    refused(path, "expected rows with fields x, y, p and t")
+
+
+@pytest.mark.parametrize("line", ["[" * 2000, "(" * 900 + "x", " " * 60_000 + "x", "t [" * 300])
+def test_a_first_line_of_brackets_takes_no_time(tmp_path, line):
+    """It once took minutes, in the search for units."""
+    refused(write(tmp_path / "a.csv", line + "\n" + "\n".join(ROWS)), "line 1: ")

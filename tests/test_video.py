@@ -260,3 +260,24 @@ def test_a_link_to_itself_is_no_output(tmp_path):
     with pytest.raises(OutputError, match="out: points to itself: choose another output"):
         write_video(tmp_path / "out", ramp(1))
     assert (tmp_path / "out").is_symlink()
+
+
+@pytest.mark.parametrize("name, speed", [("a.mp4", 1.0), ("a.mp4", 0.25), ("a.gif", 1.0)])
+def test_pictures_are_shown_at_their_times(tmp_path, name, speed):
+    times = np.cumsum([0, 40_000, 40_000, 30_000, 100_000, 20_000]) + 1_700_000_000_000_000
+    writer = open_writer(tmp_path / name, speed=speed)
+    for picture, time in zip(ramp(6), times, strict=True):
+        writer.write(picture, int(time))
+    writer.finish()
+    assert writer.slower == pytest.approx(1 / speed)
+    with av.open(str(tmp_path / name)) as container:
+        shown = [float(frame.pts * frame.time_base) for frame in container.decode(video=0)]
+    np.testing.assert_allclose(shown, (times - times[0]) / 1e6 / speed, atol=1e-4)
+
+
+def test_pictures_closer_than_a_gif_can_tell_play_slower(tmp_path):
+    writer = open_writer(tmp_path / "a.gif")
+    for number, picture in enumerate(ramp(5)):
+        writer.write(picture, 10_000 * number)  # a gif's players show 50 per second at most
+    writer.finish()
+    assert writer.slower == pytest.approx(2)

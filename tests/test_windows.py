@@ -1,10 +1,11 @@
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from firenet_jax.events import Events, Frames, Recording, RecordingError
-from firenet_jax.windows import Windows, _grid_spans, cut
+from firenet_jax.windows import Windows, _grid_spans, cut, in_words, usual
 
 
 def recording_of(t, frames=None, chunk=7, height=2, width=3):
@@ -182,3 +183,39 @@ def test_after_the_last_frame_the_clock_goes_on_as_it_mostly_did():
     assert times_of(recording, between_frames=True) == [
         [0], [5, 10], [15, 20], [25, 30], [35, 40], [45, 50], [55],
     ]  # fmt: skip
+
+
+def test_windows_of_at_most_so_many_events_and_so_long():
+    """Against a loop over events; chunks of any size give the same."""
+    rng = np.random.default_rng(0)
+    t = np.sort(rng.integers(0, 10**6, 3000)) // 7 * 7 + np.repeat([0, 5 * 10**6], [2000, 1000])
+    zeros = np.zeros(3000, np.int16)
+    events = Events.of(t, zeros, zeros, zeros)
+    expected, begin = [0], 0
+    for i in range(3000):
+        if t[i] - t[begin] >= 20_000 or i - begin == 50:
+            begin = i
+            expected.append(i)
+    for size in (1, 7, 500, 3000):
+        chunks = [events.select(slice(k, k + size)) for k in range(0, 3000, size)]
+        recording = Recording(Path("a"), "test", 10, 10, lambda chunks=chunks: iter(chunks))
+        found = list(cut(recording, Windows(events=50, longest=20)))
+        assert [len(window.events) for window in found] == np.diff([*expected, 3000]).tolist()
+        assert [window.time for window in found] == [t[i - 1] for i in (*expected[1:], 3000)]
+
+
+@pytest.mark.parametrize("seconds, longest", [(0.0, 0.001), (0.1, 5.0), (0.8, 40.0), (60.0, 40.0)])
+def test_what_is_usual_depends_on_how_long_a_recording_is(seconds, longest):
+    t = np.linspace(0, seconds * 1e6, 50).astype(np.int64)
+    zeros = np.zeros(50, np.int16)
+    windows = usual(iter([Events.of(t, zeros, zeros, zeros)]))
+    assert windows == Windows(longest=longest)
+    assert (
+        in_words(windows, 100) == f"windows of 0.35 events per pixel (35), at most {longest:g} ms"
+    )
+
+
+@pytest.mark.parametrize("other", [{"duration": 5.0}, {"between_frames": True}, {"step": 3}])
+def test_a_longest_window_is_one_of_events(other):
+    with pytest.raises(ValueError, match="longest limits windows of events"):
+        Windows(longest=40.0, **other)

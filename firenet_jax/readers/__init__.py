@@ -50,11 +50,15 @@ class Source:
     size: tuple[int, int] | None = None  # (height, width) where the file says it
     count: int | None = None  # number of events where the file says it
     frames: Frames | None = None
+    grey: bool = False  # whether the file says that the sensor sees no colours
     place: Callable[[int], str] = event_number  # row, from 0 -> its name in the file: "line 7"
 
 
 def open_recording(
-    path: str | Path, sensor_size: tuple[int, int] | None = None, strict: bool = False
+    path: str | Path,
+    sensor_size: tuple[int, int] | None = None,
+    strict: bool = False,
+    columns: str | None = None,
 ) -> Recording:
     """A recording of any known format -> Recording, opened but not read.
 
@@ -62,6 +66,7 @@ def open_recording(
     names none it is inferred by reading the events once, and a notice says so.
     A file is read up to where it is damaged, and single rows that cannot be events are left out,
     at most one in a thousand; a notice says what. strict: both raise RecordingError instead.
+    columns: their order in a text or array that does not name them, such as "x,y,p,t".
     Raises RecordingError for a missing, empty, unknown or damaged file, and, when the events get
     there, for more bad rows than that.
     """
@@ -77,12 +82,14 @@ def open_recording(
     for name in FORMATS:
         module = importlib.import_module(f"{__name__}.{name}")
         if module.matches(path):
-            source = module.read(path)
+            if columns is not None and name not in ("text", "npy"):
+                raise RecordingError(f"{path}: is of a format that sets the order of its columns")
+            source = module.read(path) if columns is None else module.read(path, columns=columns)
             break
     else:
         raise RecordingError(
             f"{path}: not a recording of a known format: expected text or zip, an ECD or EVREAL "
-            "folder, HDF5, N-Caltech101 .bin, .dat, .raw, .aedat4, .es, or a ROS bag"
+            "folder, HDF5, .npy, .npz, N-Caltech101 .bin, .dat, .raw, .aedat4, .es, or a ROS bag"
         )
     said = 0
 
@@ -96,7 +103,8 @@ def open_recording(
     def events(height: int | None, width: int | None) -> Iterator[Events]:
         return checked(source.events(), path, height, width, source.place, strict, say)
 
-    height, width = sensor_size or _stated(path, source) or _infer_size(path, events(None, None))
+    size = sensor_size or _stated(path, source)
+    height, width = size or _infer_size(path, events(None, None))
     return Recording(
         path=path,
         format=source.format,
@@ -105,6 +113,8 @@ def open_recording(
         events=lambda: events(height, width),
         count=source.count,
         frames=source.frames,
+        inferred=size is None,
+        grey=source.grey,
     )
 
 

@@ -52,6 +52,7 @@ class Layout(NamedTuple):
     events: int  # stream
     frames: int | None  # stream; None: no frames
     size: tuple[int, int] | None  # (height, width)
+    explorer: bool  # whether the camera is a DVXplorer, of which none sees colours
 
 
 def matches(path: Path) -> bool:
@@ -61,7 +62,13 @@ def matches(path: Path) -> bool:
 def read(path: Path) -> Source:
     layout = _layout(path)
     frames = _frames(path, layout)
-    return Source("AEDAT4", lambda: joined(_events(path, layout)), layout.size, frames=frames)
+    return Source(
+        "AEDAT4",
+        lambda: joined(_events(path, layout)),
+        layout.size,
+        frames=frames,
+        grey=layout.explorer or (frames is not None and _is_grey(path, layout)),
+    )
 
 
 # ---- Flatbuffers: a table says where its fields are, a vector how long it is
@@ -136,6 +143,7 @@ def _layout(path: Path) -> Layout:
         events[0],
         frames[0] if frames else None,
         streams[events[0]][1],
+        b">DVXplorer_" in header,
     )
 
 
@@ -218,6 +226,14 @@ def _frames(path: Path, layout: Layout) -> Frames | None:
         return None
     times = np.array(times[: len(places)], np.int64)
     return Frames(times, lambda i: _frame(path, layout, places[i]))
+
+
+def _is_grey(path: Path, layout: Layout) -> bool:
+    """Whether the first frame has one channel: cameras with a mosaic write colours."""
+    with open(path, "rb") as file:
+        place, size = next(_packets(path, file, layout, layout.frames))
+        data = _unpacked(file, layout, place, size, HEAD)
+    return _field(data, _root(data), 5, "b", 0) == 0
 
 
 def _time(data: bytes) -> int:

@@ -37,7 +37,7 @@ def read(path: Path) -> Source:
         with _guarded(path):
             width, height = faery.events_stream_from_file(path).dimensions()
         size = (height, width)
-    return Source(name, lambda: joined(_events(faery, path, cut)), size)
+    return Source(name, lambda: joined(_events(faery, path, cut)), size, grey=kind == ".raw")
 
 
 def _raw_header(path: Path) -> tuple[str, tuple[int, int] | None, bool]:

@@ -54,7 +54,9 @@ def read(path: Path) -> Source:
     count, left = divmod(path.stat().st_size - start, 8)
     layout = VERSIONS[version]
     size = header_size(header)
-    return Source("Prophesee DAT", lambda: _events(path, start, count, layout, left), size, count)
+    return Source(
+        "Prophesee DAT", lambda: _events(path, start, count, layout, left), size, count, grey=True
+    )
 
 
 def read_header(file: BufferedReader) -> str:

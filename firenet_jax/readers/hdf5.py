@@ -1,15 +1,19 @@
-"""HDF5 -> Source: the layouts of event_cnn_minimal, DSEC and MVSEC.
+"""HDF5 -> Source: the layouts of event_cnn_minimal, DSEC, MVSEC, v2e and Metavision.
 
     event_cnn_minimal   events/{xs, ys, ts, ps}; images/image%09d with attribute `timestamp`;
                         root attribute `sensor_resolution` (H, W)
     DSEC                events/{x, y, t, p}, t in microseconds after `t_offset`; compressed (blosc)
     MVSEC               davis/left/events, rows x, y, t, p with p -1 or 1;
                         davis/left/{image_raw, image_raw_ts}
+    v2e                 events, rows t, x, y, p, t in microseconds
+    Metavision          CD/events with fields x, y, p, t, in microseconds; its compression needs
+                        Metavision's own plugin; root attribute `geometry` "1280x720"
 
 Times are microseconds where they are integers, seconds where they are floating. The file is opened
 anew by every pass over the events and for every frame, and read in slices.
 """
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +21,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from firenet_jax.events import Events, Frames, RecordingError
+from firenet_jax.events import Events, Frames, RecordingError, Rows
 from firenet_jax.readers import (
     Source,
     extra,
@@ -31,6 +35,7 @@ from firenet_jax.readers import (
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 COLUMNS = {"event_cnn_minimal": ("ts", "xs", "ys", "ps"), "DSEC": ("t", "x", "y", "p")}
 MVSEC = "davis/left"
+METAVISION = "CD/events"
 
 
 def matches(path: Path) -> bool:
@@ -51,6 +56,8 @@ def read(path: Path) -> Source:
         if size is not None:
             height, width = np.ravel(size)[:2]
             size = int(height), int(width)
+        elif match := re.fullmatch(r"(\d+)x(\d+)", str(file.attrs.get("geometry", ""))):
+            size = int(match[2]), int(match[1])
     if size is None and frames is not None:
         size = frames.read(0).shape
     return Source(f"HDF5 ({layout})", lambda: _events(path, layout), size, count, frames)
@@ -72,28 +79,48 @@ def _layout(path: Path, file: h5py.File) -> str:
                 return layout
     if f"{MVSEC}/events" in file:
         return "MVSEC"
+    if isinstance(events, h5py.Dataset):
+        return "v2e"
+    if METAVISION in file:
+        return "Metavision"
     found = list(map(str, file))  # names that are no text are bytes
     if isinstance(events, h5py.Group):
         found += [f"events/{name}" for name in events]
     raise RecordingError(
         f"{path}: holds {', '.join(found) or 'nothing'}, expected the columns events/xs, ys, ts, "
-        "ps (event_cnn_minimal), events/x, y, t, p (DSEC), or davis/left/events (MVSEC)"
+        "ps (event_cnn_minimal), events/x, y, t, p (DSEC), davis/left/events (MVSEC), events (v2e) "
+        "or CD/events (Metavision)"
     )
 
 
 def _reader(path: Path, file: h5py.File, layout: str) -> tuple[Callable[[slice], Events], int]:
     """(rows -> Events, number of rows)"""
-    if layout == "MVSEC":
-        events = file[f"{MVSEC}/events"]
+    if layout in ("MVSEC", "v2e"):
+        events = file[f"{MVSEC}/events" if layout == "MVSEC" else "events"]
         _check_stored(path, events)
         if events.ndim != 2 or events.shape[1] != 4:
             raise RecordingError(
-                f"{path}: {MVSEC}/events has the shape {events.shape}, expected (N, 4)"
+                f"{path}: {events.name.strip('/')} has the shape {events.shape}, expected (N, 4)"
             )
 
-        def read(rows: slice) -> Events:
-            x, y, t, p = events[rows].T
-            return to_events(path, rows.start, t, x, y, p)
+        def read(rows: slice) -> Events | Rows:
+            order = "xytp" if layout == "MVSEC" else "txyp"
+            columns = dict(zip(order, events[rows].T, strict=True))
+            return to_events(path, rows.start, *(columns[name] for name in "txyp"))
+
+        return read, len(events)
+    if layout == "Metavision":
+        events = file[METAVISION]
+        _check_stored(path, events)
+        if not set("txyp") <= set(events.dtype.names or ()) or events.ndim != 1:
+            raise RecordingError(
+                f"{path}: {METAVISION} is {events.dtype} of shape {events.shape}, expected rows "
+                "with fields x, y, p and t"
+            )
+
+        def read(rows: slice) -> Events | Rows:
+            part = events[rows]
+            return to_events(path, rows.start, *(part[name] for name in "txyp"))
 
         return read, len(events)
 
@@ -136,7 +163,7 @@ def _frames(path: Path, file: h5py.File, layout: str) -> Frames | None:
             return None
         times = file[f"{MVSEC}/image_raw_ts"][:]
         return Frames(frame_times(path, times), lambda i: _frame(path, f"{MVSEC}/image_raw", i))
-    if layout == "DSEC" or not len(file.get("images", ())):
+    if layout != "event_cnn_minimal" or not len(file.get("images", ())):
         return None
     names = sorted(file["images"])
     times = np.array([file["images"][name].attrs["timestamp"] for name in names])

@@ -1,4 +1,4 @@
-"""Folder of .npy files -> Source: the layouts of EVREAL and of event_cnn_minimal.
+"""numpy's files -> Source: folders as EVREAL's and event_cnn_minimal's, or one .npy or .npz.
 
     EVREAL   event_cnn_minimal
     events_ts.npy   t.npy            (N,)       times, float64 seconds (integers: microseconds)
@@ -8,17 +8,29 @@
     images_ts.npy   timestamps.npy   (F,)       their times, seconds
     metadata.json   metadata.json               {"sensor_resolution": [H, W]}; may be missing
 
-The files are mapped, not read, and sliced as the events are asked for.
+    one file: rows (N, 4) of t, x, y, p; a structured array with fields of these names (or ts, xs,
+    ys, ps and the like); or, of an .npz, four arrays of these names. Times as above; no size.
+
+The files are mapped, not read, and sliced as the events are asked for; but an .npz is read whole.
 """
 
 import json
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from firenet_jax.events import Events, Frames, RecordingError
-from firenet_jax.readers import Source, frame_times, in_chunks, reading, to_events, to_frame
+from firenet_jax.events import Events, Frames, RecordingError, Rows
+from firenet_jax.readers import (
+    Source,
+    frame_times,
+    in_chunks,
+    reading,
+    text,
+    to_events,
+    to_frame,
+)
 
 # layout: files of times, coordinates, polarities, frame times
 FILES = {
@@ -27,11 +39,27 @@ FILES = {
 }
 
 
+NPZ = 1 << 34  # bytes of all arrays in an .npz, at most
+
+
 def matches(path: Path) -> bool:
+    if path.is_file():
+        return path.suffix.lower() in (".npy", ".npz")
     return path.is_dir() and _layout(path) is not None
 
 
-def read(path: Path) -> Source:
+def read(path: Path, columns: str | None = None) -> Source:
+    """columns: the order of those of an (N, 4) array, such as "x,y,p,t"."""
+    if path.is_file():
+        order = "txyp" if columns is None else "".join(_order(path, columns))
+        count = len(_of_one_file(path, order)[0])
+        return Source(
+            f"numpy {path.suffix.lower()}",
+            lambda: _rows(path, _of_one_file(path, order)),
+            count=count,
+        )
+    if columns is not None:
+        raise RecordingError(f"{path}: has its columns in files of their own: they have no order")
     layout = _layout(path)
     t, _, _ = _columns(path, layout)
     frames = _frames(path, layout)
@@ -59,6 +87,60 @@ def _columns(path: Path, layout: str) -> list[np.ndarray]:
             "expected (N,), (N, 2) and (N,)"
         )
     return [t, xy, p]
+
+
+def _order(path: Path, columns: str) -> list[str]:
+    named = [word.strip().lower() for word in columns.split(",")]
+    if sorted(named) != sorted("txyp"):
+        raise RecordingError(f"{path}: columns are {columns!r}, expected an order as x,y,p,t")
+    return named
+
+
+def _of_one_file(path: Path, order: str) -> list[np.ndarray]:
+    """-> t, x, y, p"""
+    if path.suffix.lower() == ".npz":
+        with reading(path, Exception), zipfile.ZipFile(path) as archive:
+            if sum(info.file_size for info in archive.infolist()) > NPZ:
+                raise ValueError(f"claims more than {NPZ >> 30} GB")
+        with reading(path, Exception), np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        if len(arrays) == 1:
+            (array,) = arrays.values()
+        else:
+            return _named(path, arrays)
+    else:
+        array = _mapped(path)
+    if array.dtype.names is not None and array.ndim == 1:
+        return _named(path, {name: array[name] for name in array.dtype.names})
+    if array.ndim != 2 or array.shape[1] != 4 or array.dtype.kind not in "iuf":
+        raise RecordingError(
+            f"{path}: holds {array.dtype} of shape {array.shape}, expected rows (N, 4) of t, x, y, "
+            "p or fields of these names"
+        )
+    if order == "txyp" and (other := text.other_order(array[: text.SNIFFED].T)):
+        raise RecordingError(
+            f"{path}: its columns look like {other}, not t,x,y,p: pass --columns {other}"
+        )
+    return [array[:, order.index(name)] for name in "txyp"]
+
+
+def _named(path: Path, arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
+    found = [next((arrays[n] for n in names if n in arrays), None) for names in text.NAMES.values()]
+    if any(column is None for column in found):
+        raise RecordingError(
+            f"{path}: holds {', '.join(map(repr, arrays)) or 'nothing'}, expected t, x, y and p"
+        )
+    if len({column.shape for column in found}) != 1 or found[0].ndim != 1:
+        shapes = ", ".join(str(column.shape) for column in found)
+        raise RecordingError(f"{path}: columns of one length are expected, not {shapes}")
+    return found
+
+
+def _rows(path: Path, columns: list[np.ndarray]) -> Iterator[Events | Rows]:
+    def read(rows: slice) -> Events | Rows:
+        return to_events(path, rows.start, *(column[rows] for column in columns))
+
+    yield from in_chunks(read, len(columns[0]))
 
 
 def _events(path: Path, layout: str) -> Iterator[Events]:

@@ -72,11 +72,13 @@ def matches(path: Path) -> bool:
     return path.is_file() and name.endswith((".txt", ".csv", ".zip", ".txt.gz", ".csv.gz"))
 
 
-def read(path: Path, member: str | None = None) -> Source:
-    """member: the file to read in a zip that holds several."""
+def read(path: Path, member: str | None = None, columns: str | None = None) -> Source:
+    """member: the file to read in a zip that holds several. columns: their order, as "x,y,p,t"."""
     if path.suffix.lower() == ".zip" and member is None:
         member = _only_text(path)
-    layout = _sniff(path, member)
+    if columns is not None and _names(columns.lower()) is None:
+        raise RecordingError(f"{path}: columns are {columns!r}, expected an order as x,y,p,t")
+    layout = _sniff(path, member, columns)
     return Source(
         format="text" if member is None else "zipped text",
         events=lambda: _events(path, member, layout),
@@ -120,19 +122,24 @@ def _only_text(path: Path) -> str:
     return texts[0]
 
 
-def _sniff(path: Path, member: str | None) -> Layout:
+def _sniff(path: Path, member: str | None, columns: str | None = None) -> Layout:
     with opened(path, member) as stream:
         head = next(_pieces(stream, HEAD), b"")
     lines = head.decode("utf-8-sig", "replace").split("\n")
     if len(head) == HEAD:
         lines.pop()  # cut off
     size, names, unit, skip = None, ("t", "x", "y", "p"), None, len(lines)
+    told = columns is not None
+    if told:
+        names, unit = _names(columns.lower())
     for number, line in enumerate(map(str.strip, lines), 1):
         words = _words(line, "," if "," in line else " ")
         if match := re.fullmatch(r"%geometry:(\d+),(\d+)", line):
-            size, names = (int(match[2]), int(match[1])), ("x", "y", "p", "t")
+            size = int(match[2]), int(match[1])
+            names, told = (names if columns else ("x", "y", "p", "t")), True
         elif named := _names(line.lower().lstrip("#% ")):
-            names, unit = named
+            names, unit = (names, unit) if columns else named
+            told = True
         elif not line or line.startswith(("#", "%")):
             continue
         elif size is None and len(words) == 2 and all(map(str.isdecimal, words)):
@@ -148,6 +155,11 @@ def _sniff(path: Path, member: str | None) -> Layout:
     rows = [line for line in lines[skip:] if line.strip()][:SNIFFED]
     separator = "," if rows and "," in rows[0] else "\t" if rows and "\t" in rows[0] else " "
     rows = [_words(row, separator) for row in rows]
+    if not told and (order := _other_order(rows)):
+        raise RecordingError(
+            f"{path}: its columns look like {order}, not t,x,y,p: pass --columns {order}, or let "
+            "the file begin with such a line"
+        )
 
     def whole(name: str) -> bool:
         index = names.index(name)
@@ -173,7 +185,10 @@ def _names(line: str) -> tuple[tuple[str, ...], float | None] | None:
     """
     known = {name: key for key, names in NAMES.items() for name in names}
     units = {name: unit for unit, names in UNITS.items() for name in names}
-    line = re.sub(r"\s*[\[(]\s*([^\s,\])]*)[^\])]*[\])]", r"|\1", line.replace('"', ""))
+    if len(line) > 1000:  # which the pattern below would take long for
+        return None
+    unit_in_brackets = r"\s*[\[(]\s*([^\s,\[\]()]*)[^\[\]()]*[\])]"
+    line = re.sub(unit_in_brackets, r"|\1", line.replace('"', ""))
     words = [word.partition("|") for word in _words(line, "," if "," in line else " ")]
     named = [known.get(name, f"_{i}") for i, (name, _, _) in enumerate(words)]
     told = {i: units.get(in_brackets) for i, (_, _, in_brackets) in enumerate(words)}
@@ -188,6 +203,29 @@ def _names(line: str) -> tuple[tuple[str, ...], float | None] | None:
     if any(named.count(key) != 1 for key in NAMES):
         return None
     return tuple(named), told[named.index("t")]
+
+
+def _other_order(rows: list[list[str]]) -> str | None:
+    """ "x,y,p,t" where these rows can only be so: one column alone grows, and goes beyond pixels or
+    has fractions; one alone is 0 and 1 (or -1 and 1); and they are not where they should be."""
+    if len(rows) < 5 or any(len(row) != 4 or not all(map(_is_number, row)) for row in rows):
+        return None
+    return other_order(np.array([[float(word) for word in row] for row in rows]).T)
+
+
+def other_order(columns: np.ndarray) -> str | None:
+    """The same of numbers (4, N)."""
+    signs = [set(column.tolist()) in ({0, 1}, {-1, 1}) for column in columns]
+    times = [
+        (np.diff(column) >= 0).all()
+        and (column.max() >= REACH or (column != np.rint(column)).any())
+        for column in columns
+    ]
+    if sum(signs) != 1 or sum(times) != 1 or (times[0] and signs[3]):
+        return None
+    rest = iter("xy")
+    named = zip(times, signs, strict=True)
+    return ",".join("t" if time else "p" if sign else next(rest) for time, sign in named)
 
 
 def _whole_seconds(rows: list[list[str]], column: int) -> bool:

@@ -1,0 +1,304 @@
+"""Mutated inputs of everything that is read -> how many were read, refused, or broke the program.
+
+    python tests/mutated.py --count 50000 --seed 0          an hour and more on one core
+
+Input number n is a function of the seed and n alone: `--first N --count 1` runs one again. Inputs
+are small files of every format, written here, and with FIRENET_RECORDINGS and FIRENET_REFERENCE
+set real ones, or their beginnings. Refusing is a ValueError or OSError whose message is one line;
+anything else is a fault of ours: another exception, a process that ends (inputs are read in a
+worker, which is started again), more than 8 GB, more than a minute.
+"""
+
+import argparse
+import collections
+import json
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+SLOW = 60.0  # seconds
+AT_ONCE = 1000  # inputs that one worker reads: libraries keep a little of what they have opened
+NASTY = [
+    b"nan", b"-1", b"1e999", b"9" * 400, "١٢٣".encode(), b"\x0c", b"\x00", b"\xff\xfe", b"0x10",
+    b"", b" ", b",", b"\n", b"\r", b'"', b"..", b"{", b"[" * 2000, b"1_000", b"\xef\xbb\xbf",
+    b"inf", b"-0", b"2147483648", b"9223372036854775808", b"1.5", b"\t",
+]  # fmt: skip
+
+
+# ---- Whole inputs: name -> files of a folder, and which of them is read
+
+
+def inputs(folder: Path) -> dict[str, Path]:
+    """Writes them; returns what is opened, by name."""
+    import h5py
+    from PIL import Image
+
+    from firenet_jax.checkpoint import save_weights
+    from firenet_jax.network import Weights
+    from firenet_jax.video import write_video
+
+    rng = np.random.default_rng(0)
+    count, found = 300, {}
+    t = np.sort(rng.integers(0, 10**6, count))
+    x, y, p = rng.integers(0, 24, count), rng.integers(0, 20, count), rng.integers(0, 2, count)
+    rows = [f"{a / 1e6:.6f} {b} {c} {d}" for a, b, c, d in zip(t, x, y, p, strict=True)]
+
+    def made(name: str, content: bytes) -> Path:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+        found.setdefault(name.partition("/")[0], path)
+        return path
+
+    text = "24 20\n" + "\n".join(rows) + "\n"
+    made("a.txt", text.encode())
+    made("named.csv", ("t,x,y,p\n" + "\n".join(row.replace(" ", ",") for row in rows)).encode())
+    with zipfile.ZipFile(folder / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("events.txt", text)
+    found["a.zip"] = folder / "a.zip"
+    for name, content in (("events.txt", "\n".join(rows)), ("images.txt", "0.1 images/a.png\n")):
+        made(f"ecd/{name}", content.encode())
+    (folder / "ecd/images").mkdir()
+    Image.fromarray(np.zeros((20, 24), np.uint8)).save(folder / "ecd/images/a.png")
+    found["ecd"] = folder / "ecd"
+    with h5py.File(folder / "a.h5", "w") as file:
+        for name, column in (("xs", x), ("ys", y), ("ts", t / 1e6), ("ps", p > 0)):
+            file[f"events/{name}"] = column
+        for k in range(4):
+            file[f"images/image{k:09d}"] = np.zeros((20, 24), np.uint8)
+            file[f"images/image{k:09d}"].attrs["timestamp"] = k / 4
+        file.attrs["sensor_resolution"] = (20, 24)
+    found["a.h5"] = found["training.h5"] = folder / "a.h5"
+    folder_of = folder / "npy"
+    folder_of.mkdir()
+    for name, column in (("t", t / 1e6), ("xy", np.stack([x, y], 1)), ("p", p > 0)):
+        np.save(folder_of / f"{name}.npy", column)
+    (folder_of / "metadata.json").write_text('{"sensor_resolution": [20, 24]}')
+    found["npy"] = folder_of
+    words = np.stack([t, x | y << 14 | p << 28], 1).astype("<u4").tobytes()
+    made("a.dat", b"% Version 2\n% Width 24\n% Height 20\n\x00\x08" + words)
+    bits = [x, y, p << 7 | t >> 16, t >> 8 & 255, t & 255]
+    made("a.bin", np.stack(bits, 1).astype(np.uint8).tobytes())
+    evt3 = np.array([0x8001, 0x6001, 0x0003, 0x2805, 0x3002, 0x4FFF, 0x50FF] * 60, "<u2")
+    made("a.raw", b"% evt 3.0\n% geometry 1280x720\n% end\n" + evt3.tobytes())
+    save_weights(folder / "weights.npz", Weights(_params(), True))
+    found["weights.npz"] = found["resume.npz"] = folder / "weights.npz"
+    made("hot.txt", b"1,1\n2,3\n17,4\n")
+    write_video(folder / "clip.mp4", rng.integers(0, 256, (6, 48, 64), np.uint8))
+    write_video(folder / "clip.gif", rng.integers(0, 256, (6, 48, 64), np.uint8))
+    found |= {name: folder / name for name in ("clip.mp4", "clip.gif")}
+    Image.fromarray(rng.integers(0, 256, (40, 50, 3), np.uint8)).save(folder / "picture.png")
+    Image.fromarray(rng.integers(0, 256, (40, 50, 3), np.uint8)).save(folder / "picture.jpg")
+    found |= {name: folder / name for name in ("picture.png", "picture.jpg")}
+    entry = {"step": 1, "kind": "validation", "loss": 0.5, "seconds": 1.0}
+    made("log.jsonl", "".join(json.dumps(entry | {"step": k}) + "\n" for k in range(20)).encode())
+    if samples := os.environ.get("FIRENET_RECORDINGS"):
+        beginnings = {"davis346_frames.aedat4": None, "dvxplorer_face.aedat4": 60_000,
+                      "ros1_event_camera_msgs.bag": 200_000, "evt2_sparklers.raw": 20_000,
+                      "dvs_synthetic_sweep.es": 20_000, "davis346_59_frames.aedat4": 150_000,
+                      "evt3_driving.raw": 20_000}  # fmt: skip
+        for name, size in beginnings.items():
+            if (Path(samples) / name).is_file():
+                made(name, (Path(samples) / name).read_bytes()[:size])
+    if reference := os.environ.get("FIRENET_REFERENCE"):
+        for path in Path(reference).glob("*.pth"):
+            if path.stat().st_size < 1 << 20:
+                made(path.name, path.read_bytes())
+    return found
+
+
+def _params():
+    import jax
+
+    from firenet_jax.network import initial_params
+
+    return initial_params(jax.random.key(0))
+
+
+# ---- Mutations
+
+
+def mutated(rng: np.random.Generator, data: bytes) -> bytes:
+    data = bytearray(data)
+    for _ in range(int(rng.choice([1, 1, 1, 2, 4, 16]))):
+        kind, size = int(rng.integers(8)), max(len(data), 1)
+        # Half of the places are near the beginning, where headers are.
+        at = int(rng.integers(min(size, 400) if rng.random() < 0.5 else size))
+        length = int(rng.integers(1, 40))
+        if kind == 0 and data:
+            data[min(at, len(data) - 1)] = int(rng.integers(256))
+        elif kind == 1 and data:
+            data[min(at, len(data) - 1)] ^= 1 << int(rng.integers(8))
+        elif kind == 2:
+            del data[at:]
+        elif kind == 3:
+            del data[at : at + length]
+        elif kind == 4:
+            data[at:at] = NASTY[int(rng.integers(len(NASTY)))]
+        elif kind == 5:
+            data[at : at + length] = rng.bytes(length)
+        elif kind == 6:
+            data[at : at + 4] = [b"\xff" * 4, b"\0" * 4, b"\xff\xff\xff\x7f"][int(rng.integers(3))]
+        else:
+            other = int(rng.integers(size))
+            data[at:at] = data[other : other + length]
+    return bytes(data)
+
+
+def read(name: str, path: Path) -> None:
+    """As the program reads it."""
+    from firenet_jax import batches, dataset, textures, train
+    from firenet_jax.checkpoint import load_weights
+    from firenet_jax.files import read_arrays
+    from firenet_jax.filters import read_hot_pixels
+    from firenet_jax.readers import open_recording
+
+    if name == "hot.txt":
+        read_hot_pixels(path, 20, 24)
+    elif name == "training.h5":
+        facts = batches._facts(path)
+        index = batches._index(path)
+        batches._example(
+            np.random.default_rng(0), facts, index, batches.Augment(),
+            windows=2, crop=16, chain=1, part=0,
+        )  # fmt: skip
+    elif name == "resume.npz":
+        read_arrays(path)
+    elif name.endswith((".npz", ".pth")):
+        load_weights(path)
+    elif name.startswith("clip"):
+        for _ in dataset.read_clip(path):
+            pass
+    elif name.startswith("picture"):
+        textures.load_textures(path.parent, 1, 32, 0)
+    elif name == "log.jsonl":
+        log = train.Log.__new__(train.Log)
+        log.entries = [entry for entry in train._entries(path) if entry["step"] <= 100]
+        f"{log.best():.4f}"
+    else:
+        recording = open_recording(path)
+        for number, _ in enumerate(recording.events()):
+            if number > 50:
+                break
+        if recording.frames is not None:
+            for number in range(min(3, len(recording.frames.times))):
+                recording.frames.read(number)
+
+
+def one(seed: int, number: int, whole: dict[str, Path], folder: Path) -> tuple[str, str]:
+    """(what was read, what came of it): "read", "refused: ..." or "FAULT: ..." """
+    import shutil
+
+    rng = np.random.default_rng((seed, number))
+    name = sorted(whole)[number % len(whole)]
+    source = whole[name]
+    target = folder / ("training.h5" if name == "training.h5" else source.name)
+    if source.is_dir():
+        shutil.copytree(source, target)
+        files = sorted(file for file in target.rglob("*") if file.is_file())
+        changed = files[int(rng.integers(len(files)))]
+    else:
+        target.write_bytes(source.read_bytes())
+        changed = target
+    changed.write_bytes(mutated(rng, changed.read_bytes()))
+    try:
+        read(name, target)
+    except (ValueError, OSError) as error:
+        if len(str(error).splitlines()) == 1 and type(error).__name__ != "UnicodeDecodeError":
+            kind = type(error).__module__.partition(".")[0]
+            ours = kind in ("firenet_jax", "builtins")
+            return name, "refused" if ours else f"FAULT: {type(error).__name__}: {error}"
+        return name, f"FAULT: {type(error).__name__}: {str(error)[:300]!r}"
+    except BaseException as error:
+        return name, f"FAULT: {type(error).__name__}: {str(error)[:300]!r}"
+    finally:
+        shutil.rmtree(target, ignore_errors=True)
+        target.unlink(missing_ok=True)
+    return name, "read"
+
+
+def work(seed: int, first: int, count: int) -> None:
+    """In a process of its own: a line for each input before and after it is read."""
+    import resource
+
+    logging.disable(logging.CRITICAL)
+    with tempfile.TemporaryDirectory() as place:
+        folder, inside = Path(place) / "whole", Path(place) / "mutated"
+        folder.mkdir()
+        inside.mkdir()
+        whole = inputs(folder)
+        resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
+        for number in range(first, first + count):
+            print(json.dumps([number, "begins", ""]), flush=True)
+            print(json.dumps([number, *one(seed, number, whole, inside)]), flush=True)
+
+
+def run(seed: int, first: int, count: int) -> tuple[collections.Counter, list[str]]:
+    """(how many came to what, the faults)"""
+    import selectors
+
+    counts, faults, number, stop = collections.Counter(), [], first, first + count
+    while number < stop:
+        command = [sys.executable, __file__, "--worker", "--seed", str(seed), "--first",
+                   str(number), "--count", str(min(stop - number, AT_ONCE))]  # fmt: skip
+        end = min(stop, number + AT_ONCE)
+        worker = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
+        watch = selectors.DefaultSelector()
+        watch.register(worker.stdout, selectors.EVENT_READ)
+        last, what = number, "ends the process"
+        started = False
+        while True:
+            if not watch.select(SLOW if started else 10 * SLOW):
+                what = "takes more than a minute"
+                worker.kill()
+                break
+            line = worker.stdout.readline()
+            if not line:
+                break
+            started = True
+            last, name, came = json.loads(line)
+            if name == "begins":
+                continue
+            counts[came.partition(":")[0]] += 1
+            if came.startswith("FAULT"):
+                faults.append(f"{last}: {name}: {came}")
+                print(faults[-1], flush=True)
+            number = last + 1
+            if number % 1000 == 0:
+                print(number, dict(counts), file=sys.stderr, flush=True)
+        code = worker.wait()
+        if number < end:
+            counts["FAULT"] += 1
+            faults.append(f"{last}: {what} (exit {code})")
+            print(faults[-1], flush=True)
+            number = last + 1
+    return counts, faults
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=50_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.worker:
+        work(options.seed, options.first, options.count)
+        return 0
+    began = time.monotonic()
+    counts, faults = run(options.seed, options.first, options.count)
+    print(f"{dict(counts)} in {time.monotonic() - began:.0f} s")
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,88 @@
+"""Arrays of one's own: what is taken, and what is refused by name."""
+
+import numpy as np
+import pytest
+
+import firenet_jax as fj
+from firenet_jax.events import concatenate
+
+T = np.array([10, 20, 20, 3_000_000])
+X, Y, P = np.array([0, 5, 23, 7]), np.array([3, 0, 19, 8]), np.array([1, 0, 0, 1])
+SIZE = {"width": 24, "height": 20}
+
+
+def columns_of(recording):
+    events = concatenate(list(recording.events()))
+    return [getattr(events, name).tolist() for name in "txyp"]
+
+
+EXPECTED = [T.tolist(), X.tolist(), Y.tolist(), P.astype(bool).tolist()]
+
+
+@pytest.mark.parametrize("p", [P, P.astype(bool), 2 * P - 1, P.astype(np.float32), P.tolist()])
+@pytest.mark.parametrize(
+    "t, unit",
+    [(T, None), (T, "us"), (T / 1e6, None), (T / 1e6, "s"), (T / 1e3, "ms"), (T / 1.0, "us"),
+     (T.astype(np.uint32), None), (T.tolist(), None)],
+)  # fmt: skip
+def test_columns_of_every_kind(t, unit, p):
+    recording = fj.recording(t, X.astype(np.uint16), Y.astype(np.float64), p, unit=unit, **SIZE)
+    assert (recording.height, recording.width, recording.count) == (20, 24, 4)
+    for _ in range(2):
+        assert columns_of(recording) == EXPECTED
+
+
+@pytest.mark.parametrize("names", ["txyp", ["timestamp", "x", "y", "polarity"]])
+def test_a_structured_array(names):
+    kind = np.dtype(
+        [(name, kind) for name, kind in zip(names, ("i8", "u2", "u2", "?"), strict=True)]
+    )
+    array = np.array([*zip(T, X, Y, P, strict=True)], kind)
+    assert columns_of(fj.recording(array, **SIZE)) == EXPECTED
+
+
+def test_they_become_tensors():
+    rng = np.random.default_rng(0)
+    t = np.sort(rng.integers(0, 10**6, 500))
+    columns = rng.integers(0, 24, 500), rng.integers(0, 20, 500), rng.random(500) < 0.5
+    recording = fj.recording(t, *columns, **SIZE)
+    found = [(tensors.shape, times) for tensors, times in fj.event_tensors(recording, events=100)]
+    assert found[0][0] == (5, 1, 20, 24, 5) and found[0][1].tolist() == t[99::100].tolist()
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"x": X[:3]}, r"one length are expected, not t \(4,\), x \(3,\)"),
+        ({"t": T[::-1]}, "event 2: time runs backwards, from 3000000 to 20 us"),
+        ({"x": [0, -10, 3, 4]}, "event 2: x is -10, but coordinates are 0 or more"),
+        ({"x": [0, 24, 3, 4]}, "event 2: x is 24, outside the sensor of 24x20"),
+        ({"y": [0, 1, 20, 4]}, "event 3: y is 20, outside the sensor of 24x20"),
+        ({"x": [0, 1.5, 3, 4]}, "event 2: x is 1.5, expected a whole number"),
+        ({"x": [0, 70_000, 3, 4]}, "event 2: x is 70000, expected a coordinate below"),
+        ({"p": [0, 1, 2, 1]}, "event 3: the polarity is 2"),
+        ({"t": [0.0, np.nan, 1.0, 2.0]}, "event 2: the time is nan"),
+        ({"t": ["a", "b", "c", "d"]}, "t is <U1, expected numbers"),
+        ({"x": ["a", "b", "c", "d"]}, "x is stored as <U1"),
+        ({"t": [], "x": [], "y": [], "p": []}, "holds no events"),
+        ({"unit": "ns"}, "unit is 'ns', expected one of s, ms, us"),
+        ({"width": 0}, "width is 0"), ({"height": 20.5}, "height is 20.5"),
+        ({"x": None, "y": None, "p": None}, "pass t, x, y and p, or one structured array"),
+        ({"x": None}, "pass t, x, y and p"),
+        ({"t": np.zeros(3, [("a", "i4")]), "x": None, "y": None, "p": None}, "has the fields a,"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused_at_once(change, said):
+    choices = {"t": T, "x": X, "y": Y, "p": P, **SIZE} | change
+    with pytest.raises(fj.RecordingError, match=said):
+        fj.recording(**choices)
+
+
+def test_columns_of_unequal_length_are_no_events():
+    with pytest.raises(ValueError, match=r"columns differ in length: t \(3,\), x \(2,\)"):
+        fj.Events.of([1, 2, 3], [0, 0], [0, 0], [1, 1])
+
+
+def test_version_and_a_short_repr_of_weights():
+    assert fj.__version__.count(".") >= 2
+    assert repr(fj.load_weights()) == "Weights(37,777 parameters, normalise=True)"
