@@ -22,6 +22,7 @@ Simulated pictures are textures from `textures.HELD_OUT`, which no weights of ou
 
 import argparse
 import json
+import tempfile
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,13 +31,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from harness import RESULTS, save
+from PIL import Image
 from skimage.metrics import structural_similarity
 
 import firenet_jax as fj
 from firenet_jax import metrics
 from firenet_jax.equalise import equalise
 from firenet_jax.network import Weights, initial_state
-from firenet_jax.pictures import display, initial_display_state
+from firenet_jax.pipeline import Reconstruct, run
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.scenes import SceneSettings, render
 from firenet_jax.sensor import (
@@ -269,25 +271,20 @@ def palindrome(methods: Methods, recordings: list[Path]) -> list[dict]:
     return rows
 
 
-def contrast(methods: Methods, recordings: list[Path]) -> list[dict]:
-    """Over all pictures but the first five, as the printed command shows them."""
+def contrast(files: dict[str, Path | None], recordings: list[Path]) -> list[dict]:
+    """Over all pictures but the first five."""
     rows = []
     for path in recordings:
-        recording = fj.open_recording(path)
-        states = {
-            name: (initial_state(1, recording.height, recording.width), initial_display_state(1))
-            for name in methods
-        }
-        pictures = {name: [] for name in methods}
-        for tensors, _ in fj.event_tensors(recording):
-            for name, weights in methods.items():
-                state, shown = states[name]
-                state, images = reconstruct(weights, state, tensors)
-                shown, greys = display(shown, images)
-                states[name] = state, shown
-                pictures[name].append(np.asarray(greys[:, 0]))
-        for name in methods:
-            greys = np.concatenate(pictures[name]).astype(np.float32)
+        for name, weights in files.items():
+            with tempfile.TemporaryDirectory() as folder:
+                out = Path(folder) / "out"
+                run(Reconstruct((path,), out, weights))
+                greys = np.stack(
+                    [
+                        np.asarray(Image.open(picture), np.float32)
+                        for picture in sorted(out.glob("frame_*.png"))
+                    ]
+                )
             greys = greys[min(5, len(greys) - 1) :]
             brightness = greys.mean((-2, -1))
             moved = np.abs(np.diff(brightness))
@@ -295,6 +292,7 @@ def contrast(methods: Methods, recordings: list[Path]) -> list[dict]:
                 {
                     "recording": path.name,
                     "weights": name,
+                    "pictures": len(greys),
                     "deviation": float(greys.std((-2, -1)).mean()),
                     "brightness": float(brightness.mean()),
                     "moves": float(moved.mean()) if len(moved) else 0.0,
@@ -361,7 +359,7 @@ def frames(methods: Methods, recordings: list[Path]) -> list[dict]:
 
 SIMULATED = {"long": long, "rest": rest, "density": density}
 QUICK = {"long": 4, "rest": 1, "density": 1}
-RECORDED = {"palindrome": palindrome, "contrast": contrast, "frames": frames}
+RECORDED = {"palindrome": palindrome, "frames": frames, "contrast": contrast}
 
 
 def _readable(path: Path) -> bool:
@@ -390,10 +388,11 @@ def main():
     parser.add_argument("--only", nargs="*", default=[*SIMULATED, *RECORDED])
     parser.add_argument("--quick", action="store_true", help="fewer sequences; writes nothing")
     options = parser.parse_args()
-    methods = {}
+    files = {}
     for each in options.weights:
         name, _, path = each.rpartition("=")
-        methods[name or Path(path).stem] = fj.load_weights(None if path == "built-in" else path)
+        files[name or Path(path).stem] = None if path == "built-in" else Path(path)
+    methods = {name: fj.load_weights(path) for name, path in files.items()}
     recordings = sorted(options.recordings.iterdir()) if options.recordings else []
     recordings = [path for path in recordings if _readable(path)]
     last = RESULTS / "endurance.json"
@@ -405,7 +404,7 @@ def main():
         if name in SIMULATED:
             rows = function(methods, QUICK[name]) if options.quick else function(methods)
         else:
-            rows = function(methods, recordings)
+            rows = function(files if function is contrast else methods, recordings)
         print(f"\n{name}")
         table(rows)
         others = [row for row in results.get(name, []) if row["weights"] not in methods]
