@@ -8,7 +8,7 @@ Three parts, each in one run with the methods in turn:
               part of our step, which simulates its data, the simulation takes
 
 "JAX in scan" is what `reconstruct` does: on a CPU, where it can, with the step as machine code
-(`firenet_jax/native.py`); "XLA in scan" is the same scan over the step that XLA compiles.
+(`firenet_jax/native`); "XLA in scan" is the same scan over the step that XLA compiles.
 PyTorch runs as the field's programs do (eager, NCHW, separate gates) and as it runs best: our fused
 gates, channels_last, torch.compile, frozen TorchScript, bfloat16, and CUDA graphs on a GPU. A
 step outside of a scan is PyTorch's only kind. Before anything is timed the float32 results are

@@ -1,4 +1,4 @@
-"""Image, kernel -> image: the convolution of all layers, quick on a CPU too, and its gradient.
+"""Maps, kernel, bias -> maps: the layer of all networks here, quick on a CPU too; its gradient.
 
 Images are (B, H, W, channels), kernels (rows, columns, inputs, outputs), odd sizes, zero padding,
 no striding. On accelerators all is XLA's. On a CPU, 3x3 convolutions and their gradients are
@@ -7,10 +7,12 @@ with few channels in another form, but for the gradient with respect to the kern
 XLA computes it in a way that takes many times as long as the matrix products below.
 """
 
+from collections.abc import Sequence
 from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 
 from firenet_jax import native
 
@@ -54,36 +56,103 @@ def side_by_side(image: jax.Array, kernel: jax.Array, pixels: int) -> jax.Array:
 
 def convolve(image: jax.Array, kernel: jax.Array) -> jax.Array:
     """(B, H, W, I), (rows, columns, I, O) -> (B, H, W, O); gradients in reverse mode only."""
-    return _convolve_by(native.is_wanted(), image, kernel)
+    return layer([image], kernel)[0]
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _convolve_by(machine_code: bool, image, kernel):
-    ours = native.choose if machine_code else _only_xla
-    return ours(lambda *these: native.convolve(*these), _convolve, image, kernel)
+def layer(
+    maps: Sequence[jax.Array],
+    kernel: jax.Array,
+    bias: jax.Array | None = None,
+    activations: tuple[str, ...] = ("none",),
+) -> tuple[jax.Array, ...]:
+    """Maps of as many channels each, convolved as one -> activation(. + bias), one map a name.
+
+    (B, H, W, I / maps), (rows, columns, I, O), (O,) -> (B, H, W, O / names); activations by the
+    names of `ACTIVATIONS`. For gradients, in reverse mode only, the results are kept, under the
+    name `CONVOLVED` (jax.checkpoint).
+    """
+    bias = jnp.zeros(kernel.shape[3], kernel.dtype) if bias is None else bias
+    return _layer(native.is_wanted(), activations, tuple(maps), kernel, bias)
 
 
-def _only_xla(_, xla, *arguments):
-    return xla(*arguments)
+# An activation, and its derivative as a function of its result.
+ACTIVATIONS = {
+    "none": (lambda x: x, jnp.ones_like),
+    "relu": (jax.nn.relu, lambda y: (y > 0).astype(y.dtype)),
+    "sigmoid": (jax.nn.sigmoid, lambda y: y * (1 - y)),
+    "tanh": (jnp.tanh, lambda y: 1 - y * y),
+}
+CONVOLVED = "convolved"
 
 
-def _forward(machine_code, image, kernel):
-    return _convolve_by(machine_code, image, kernel), (image, kernel)
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _layer(machine_code: bool, activations, maps, kernel, bias):
+    def by_xla(maps, kernel, bias):
+        sums = _convolved_by_xla(maps, kernel, 1)[0] + bias.reshape(1, 1, 1, -1)
+        parts = jnp.split(sums, len(activations), -1)
+        return tuple(ACTIVATIONS[name][0](x) for name, x in zip(activations, parts, strict=True))
+
+    def by_machine_code(maps, kernel, bias):
+        return tuple(native.convolve(maps, kernel, bias, activations))
+
+    return _choose(machine_code, by_machine_code, by_xla, maps, kernel, bias)
 
 
-def _backward(machine_code, kept, gradient):
-    image, kernel = kept
-    flipped = kernel[::-1, ::-1].swapaxes(2, 3)
-    ours = native.choose if machine_code else _only_xla
-    by_kernel = ours(
-        lambda *these: native.kernel_gradient(*these),
-        partial(jax.lax.platform_dependent, cpu=kernel_gradient, default=_xla_kernel_gradient),
-        *(image, kernel, gradient),
+def _convolved_by_xla(maps, kernel, results: int):
+    return tuple(jnp.split(_convolve(_joined(maps), kernel), results, -1))
+
+
+def _joined(maps):
+    return maps[0] if len(maps) == 1 else jnp.concatenate(maps, -1)
+
+
+def _choose(machine_code: bool, *functions_and_arguments):
+    if machine_code:
+        return native.choose(*functions_and_arguments)
+    _, by_xla, *arguments = functions_and_arguments
+    return by_xla(*arguments)
+
+
+def _forward(machine_code, activations, maps, kernel, bias):
+    results = _layer(machine_code, activations, maps, kernel, bias)
+    results = tuple(checkpoint_name(result, CONVOLVED) for result in results)
+    return results, (maps, kernel, results)
+
+
+def _backward(machine_code, activations, kept, gradients):
+    maps, kernel, results = kept
+    gradients = tuple(
+        gradient * ACTIVATIONS[name][1](result) if name != "none" else gradient
+        for gradient, name, result in zip(gradients, activations, results, strict=True)
     )
-    return _convolve_by(machine_code, gradient, flipped), by_kernel
+
+    def images_by_machine_code(gradients, flipped):
+        return tuple(native.convolve(gradients, flipped, None, ("none",) * len(maps)))
+
+    def kernels_by_xla(maps, kernel, gradients):
+        by = partial(jax.lax.platform_dependent, cpu=kernel_gradient, default=_xla_kernel_gradient)
+        joined = _joined(gradients)
+        # Summed in float32, whatever the gradients' type.
+        by_bias = jnp.sum(joined, (0, 1, 2), dtype=jnp.float32).astype(kernel.dtype)
+        return by(_joined(maps), kernel, joined), by_bias
+
+    flipped = kernel[::-1, ::-1].swapaxes(2, 3)
+    by_maps = _choose(
+        machine_code,
+        images_by_machine_code,
+        partial(_convolved_by_xla, results=len(maps)),
+        *(gradients, flipped),
+    )
+    by_kernel_and_bias = _choose(
+        machine_code,
+        lambda *these: native.gradients(*these),
+        kernels_by_xla,
+        *(maps, kernel, gradients),
+    )
+    return by_maps, *by_kernel_and_bias
 
 
-_convolve_by.defvjp(_forward, _backward)
+_layer.defvjp(_forward, _backward)
 
 
 def _xla_kernel_gradient(image, kernel, gradient):

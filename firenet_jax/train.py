@@ -49,6 +49,7 @@ from tensorboardX import SummaryWriter
 from firenet_jax import metrics
 from firenet_jax.batches import NOTHING, Augment, batches, split
 from firenet_jax.checkpoint import load_weights, save_weights
+from firenet_jax.convolution import CONVOLVED
 from firenet_jax.devices import (
     BATCH,
     EVERYWHERE,
@@ -63,7 +64,6 @@ from firenet_jax.events import logger
 from firenet_jax.files import differences, locked, write_text
 from firenet_jax.losses import DISTANCES, Loss, sequence_loss
 from firenet_jax.network import (
-    CONVOLVED,
     State,
     Weights,
     initial_params,

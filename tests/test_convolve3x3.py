@@ -12,7 +12,7 @@ pytest.importorskip("llvmlite")
 
 from firenet_jax import convolution, native
 from firenet_jax.native import Unavailable, llvm
-from firenet_jax.native.convolve3x3 import _convolution, _parts, _sums, _total
+from firenet_jax.native.convolve3x3 import Layer, _convolution, _parts, _sums, _total
 
 pytestmark = pytest.mark.skipif(
     jax.default_backend() != "cpu" or llvm.vectors() == 0,
@@ -54,6 +54,14 @@ def exact(image, kernel, gradient):
     return result, by_kernel.reshape(kernel.shape)
 
 
+def ours(image, kernel, gradient):
+    image, kernel, gradient = map(jnp.asarray, (image, kernel, gradient))
+    (result,) = native.convolve([image], kernel)
+    by_kernel, by_bias = native.gradients([image], kernel, [gradient])
+    assert_same(by_bias, np.asarray(gradient, np.float64).sum((0, 1, 2)))
+    return result, by_kernel
+
+
 def assert_same(found, expected):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
 
@@ -62,12 +70,13 @@ def assert_same(found, expected):
 def test_equals_float64_and_xla(shape):
     image, kernel, gradient = random_case(*shape)
     result, by_kernel = exact(image, kernel, gradient)
-    found = native.convolve(jnp.asarray(image), jnp.asarray(kernel))
+    found, found_gradient = ours(image, kernel, gradient)
     assert_same(found, result)
     assert_same(found, np.asarray(convolution._plain(image, kernel)))
-    found = native.kernel_gradient(*map(jnp.asarray, (image, kernel, gradient)))
-    assert_same(found, by_kernel)
-    assert_same(found, np.asarray(convolution._xla_kernel_gradient(image, kernel, gradient)))
+    assert_same(found_gradient, by_kernel)
+    assert_same(
+        found_gradient, np.asarray(convolution._xla_kernel_gradient(image, kernel, gradient))
+    )
 
 
 def test_on_processors_with_vectors_of_256_bits(monkeypatch):
@@ -78,9 +87,7 @@ def test_on_processors_with_vectors_of_256_bits(monkeypatch):
     for shape in [(2, 10, 33, 5, 16), (1, 9, 21, 32, 32)]:
         image, kernel, gradient = random_case(*shape)
         result, by_kernel = exact(image, kernel, gradient)
-        assert_same(native.convolve(jnp.asarray(image), jnp.asarray(kernel)), result)
-        found = native.kernel_gradient(*map(jnp.asarray, (image, kernel, gradient)))
-        assert_same(found, by_kernel)
+        jax.tree.map(assert_same, ours(image, kernel, gradient), (result, by_kernel))
 
 
 def layers(convolve, kernels, image):
@@ -102,7 +109,7 @@ def test_in_scans_maps_and_computed_again():
     rng = np.random.default_rng(0)
     kernels = jnp.asarray(0.1 * rng.normal(size=(2, 3, 3, 16, 16)), jnp.float32)
     images = jnp.asarray(rng.normal(size=(3, 4, 2, 11, 13, 16)), jnp.float32)
-    ours = jax.value_and_grad(partial(layers, convolution.convolve), (0, 1))
+    machine = jax.value_and_grad(partial(layers, convolution.convolve), (0, 1))
     theirs = jax.value_and_grad(partial(layers, convolution._plain), (0, 1))
     for transform in (
         lambda f: lambda kernels, images: f(kernels, images[0]),
@@ -110,7 +117,7 @@ def test_in_scans_maps_and_computed_again():
         lambda f: lambda kernels, images: jax.lax.map(partial(f, kernels), images),
         lambda f: lambda kernels, images: jax.vmap(f)(jnp.stack([kernels] * 3), images),
     ):
-        program = jax.jit(transform(ours))
+        program = jax.jit(transform(machine))
         found, expected = program(kernels, images), jax.jit(transform(theirs))(kernels, images)
         jax.tree.map(assert_same, *map(lambda t: jax.tree.map(np.asarray, t), (found, expected)))
     assert "custom_call" in program.lower(kernels, images).as_text()
@@ -131,7 +138,7 @@ def test_other_types_are_xlas(kind):
 )
 def test_what_it_does_not_compute(image, kernel):
     with pytest.raises(Unavailable):
-        native.convolve(jnp.zeros(image), jnp.zeros(kernel))
+        native.convolve([jnp.zeros(image)], jnp.zeros(kernel))
     assert convolution.convolve(jnp.zeros(image), jnp.zeros(kernel)).shape == (
         *image[:3],
         kernel[3],
@@ -146,7 +153,7 @@ def test_what_is_not_finite_goes_where_it_goes_in_xla(where, what):
         image[0, 2, 29, 3] = what
     else:
         kernel[0, 1, 3, 4] = what
-    found = native.convolve(jnp.asarray(image), jnp.asarray(kernel))
+    (found,) = native.convolve([jnp.asarray(image)], jnp.asarray(kernel))
     np.testing.assert_array_equal(np.isnan(found), np.isnan(convolution._plain(image, kernel)))
 
 
@@ -165,7 +172,7 @@ def test_nothing_is_read_or_written_beside_the_arrays(shape):
     batch, height, width, inputs, outputs = shape
     image, kernel, gradient = random_case(*shape)
     result, by_kernel = exact(image, kernel, gradient)
-    parts = _parts(height)
+    parts, numbers = _parts(height), kernel.size + outputs
 
     def run(write, arrays):
         module = llvm.Module()
@@ -185,12 +192,62 @@ def test_nothing_is_read_or_written_beside_the_arrays(shape):
             np.testing.assert_array_equal(each[-SIDE:], old[-SIDE:])
         return [each[SIDE:-SIDE] for each in memory]
 
+    layer = Layer(height, width, (inputs,), ("none",), outputs, False)
     *_, found = run(
-        lambda module: [_convolution(module, *shape[1:])], [image, kernel, np.zeros_like(gradient)]
+        lambda module: [_convolution(module, layer)], [image, kernel, np.zeros_like(gradient)]
     )
     assert_same(found.reshape(result.shape), result)
     *_, found = run(
-        lambda module: [_sums(module, *shape[1:]), _total(module, batch, height, inputs, outputs)],
-        [image, gradient, np.zeros((batch * parts, kernel.size)), np.zeros_like(kernel)],
+        lambda module: [
+            _sums(module, height, width, (inputs,), (outputs,)),
+            _total(module, batch, height, 2, kernel.size + outputs),
+        ],
+        [image, gradient, np.zeros(batch * parts * numbers), np.zeros(numbers)],
     )
-    assert_same(found.reshape(kernel.shape), by_kernel)
+    assert_same(found[: kernel.size].reshape(kernel.shape), by_kernel)
+    assert_same(found[kernel.size :], gradient.astype(np.float64).sum((0, 1, 2)))
+
+
+@pytest.mark.parametrize(
+    "maps, activations",
+    [
+        ([16], ["relu"]),
+        ([16, 16], ["sigmoid", "sigmoid"]),
+        ([16, 16], ["tanh"]),
+        ([5], ["relu"]),
+        ([16, 16, 16], ["none", "tanh", "sigmoid"]),
+    ],
+)
+def test_several_maps_as_one_with_bias_and_activation(maps, activations):
+    """And all gradients, those of what XLA computes of it."""
+    rng = np.random.default_rng(0)
+
+    def random(*shape):
+        return jnp.asarray(rng.normal(size=shape), jnp.float32)
+
+    outputs = 16 * len(activations)
+    images = [random(2, 9, 35, size) for size in maps]
+    kernel, bias = 0.1 * random(3, 3, sum(maps), outputs), random(outputs)
+    weights = [random(2, 9, 35, 16) for _ in activations]
+
+    def run(alone, images, kernel, bias):
+        with native.by_xla_alone(alone):
+            results = convolution.layer(images, kernel, bias, tuple(activations))
+        return sum((a * b).sum() for a, b in zip(results, weights, strict=True)), results
+
+    def plain(images, kernel, bias):
+        sums = convolution._plain(jnp.concatenate(images, -1), kernel) + bias.reshape(1, 1, 1, -1)
+        functions = {"none": lambda x: x, "relu": jax.nn.relu, "sigmoid": jax.nn.sigmoid}
+        functions["tanh"] = jnp.tanh
+        parts = jnp.split(sums, len(activations), -1)
+        results = [functions[name](x) for name, x in zip(activations, parts, strict=True)]
+        return sum((a * b).sum() for a, b in zip(results, weights, strict=True)), tuple(results)
+
+    arguments = images, kernel, bias
+    expected = jax.value_and_grad(plain, (0, 1, 2), has_aux=True)(*arguments)
+    for alone in (False, True):
+        function = jax.jit(jax.value_and_grad(partial(run, alone), (0, 1, 2), has_aux=True))
+        assert ("custom_call" in function.lower(*arguments).as_text()) != alone
+        jax.tree.map(
+            lambda a, b: assert_same(np.asarray(a), np.asarray(b)), function(*arguments), expected
+        )

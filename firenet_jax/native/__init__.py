@@ -1,7 +1,7 @@
 """Arrays -> arrays: what is quicker as machine code of our own than as XLA's, on a CPU.
 
     step                        one window of the network, of packed parameters, enclosed states
-    convolve, kernel_gradient   a 3x3 convolution, and its gradient with respect to the kernel
+    convolve, gradients         a 3x3 layer of training; gradients of its kernel and bias
     choose                      these or what XLA computes, as platform, export and switch have it
     by_xla_alone, is_wanted     the switch for a part of a program
 
@@ -17,7 +17,7 @@ _HOME = {
     "convolve": "convolve3x3",
     "enclose": "whole_step",
     "interior": "whole_step",
-    "kernel_gradient": "convolve3x3",
+    "gradients": "convolve3x3",
     "pack": "whole_step",
     "step": "whole_step",
 }

@@ -1,13 +1,16 @@
-"""(image, kernel) -> image: the 3x3 convolution of training as machine code; its kernel's gradient.
+"""(maps, kernel, bias) -> maps: a layer of training as machine code; gradients of kernel and bias.
 
-Direct, zero padding, float32: images (B, H, W, inputs), kernels (3, 3, inputs, outputs), outputs a
-multiple of 16. Winograd's products would be fewer, but a training step keeps and reads so much
-more than it computes that there is little left to win.
+3x3, zero padding, float32, results of a multiple of 16 channels. Several maps are convolved as if
+they were one, and results are several maps too, because to join and to split them takes XLA as
+long as a convolution.
 
 What takes the time are multiply-adds of a number of one array, in all lanes, with 16 outputs in a
 register, added to sums that stay in registers: as many as a processor has, for it begins a
 multiply-add long before the last one has ended.
 """
+
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -54,69 +57,140 @@ def _between(f: Function, value, least: int, most: int):
 
 # --- The convolution ---------------------------------------------------------------------------
 
+ACTIVATIONS = {
+    "none": lambda f, x: x,
+    "relu": Function.relu,
+    "sigmoid": Function.sigmoid,
+    "tanh": Function.tanh,
+}
 
-def _width_of_block(width: int, sums: int) -> int:
-    """Pixels of a row that are worked on together; a number that leaves little over."""
-    most = max(1, min(width, sums))
-    return min(range(1, most + 1), key=lambda n: (-(-width // n) * (n + 1), -n))
+
+class Layer(NamedTuple):
+    """What is known of a convolution before it runs."""
+
+    height: int
+    width: int
+    inputs: tuple[int, ...]  # of each map
+    activations: tuple[str, ...]  # of each result
+    outputs: int  # of each result
+    has_bias: bool
+
+    @property
+    def all_inputs(self) -> int:
+        return sum(self.inputs)
+
+    @property
+    def all_outputs(self) -> int:
+        return len(self.activations) * self.outputs
+
+    @property
+    def together(self) -> int:
+        """Vectors of outputs that are worked on together: two share what they are products of."""
+        return 2 if self.all_outputs % (2 * LANES) == 0 else 1
+
+    @property
+    def pixels(self) -> int:
+        """Of a row, worked on together: a number that leaves little over."""
+        room = 28 if vectors() == 32 else 6  # sums in registers, beside what is added to them
+        most = max(1, min(self.width, room // self.together))
+        return min(range(1, most + 1), key=lambda n: (-(-self.width // n) * (n + 1), -n))
+
+    def enclosed_line(self, inputs: int) -> int:
+        """Bytes of a row of a block and its neighbours."""
+        return 4 * (self.pixels + 2) * inputs
 
 
-def _block(module: Module, pixels: int, inputs: int, outputs: int, lanes: int) -> Code:
-    """block(upper left neighbour, bytes of a row of it, kernel, target): so many pixels of a row.
+def _block(module: Module, layer: Layer, activations: tuple[str, ...]) -> Code:
+    """block(record): pixels side by side, one vector of outputs or two of these activations.
 
-    Of `lanes` vectors of outputs, in arrays of `outputs`.
+    The record is of pointers: for each map the upper left neighbour of the block and, as a number,
+    the bytes of a row of it; the kernel's first column of outputs, the bias's; for each vector of
+    outputs where its pixels go.
     """
-    name = f"block{pixels}_{lanes}"
-    f = Function(module, name, [POINTER, INT, POINTER, POINTER])
+    name = "_".join(("block", *activations))
+    f = Function(module, name, [POINTER])
     f.function.attributes.add("noinline")
-    corner, line, kernel, target = f.arguments
-    across = 3 * inputs  # numbers of a row of the kernel, and of an image that it meets
-    steps = max(n for n in range(1, 9) if across % n == 0)
+    (record,) = f.arguments
+    together, across = len(activations), 4 * layer.all_outputs
+    fields = 2 * len(layer.inputs)
+    kernel, bias, *targets = (
+        f.load(POINTER, record, 8 * (fields + i)) for i in range(2 + together)
+    )
+    sums, before = [vector(0)] * (layer.pixels * together), 0
+    if layer.has_bias:
+        sums = [f.load_unaligned(VECTOR, bias, v * VECTOR_BYTES) for v in range(together)]
+        sums = sums * layer.pixels
+    for i, inputs in enumerate(layer.inputs):
+        corner, line = f.load(POINTER, record, 16 * i), f.load(INT, record, 16 * i + 8)
+        steps = max(n for n in range(1, 9) if inputs % n == 0)
 
-    def row(i, sums):
-        numbers, weights = f.at(corner, f.b.mul(i, line)), f.times(i, 4 * across * outputs)
+        def tap(k, sums, corner=corner, line=line, inputs=inputs, steps=steps, before=before):
+            row, column = f.b.sdiv(k, integer(3)), f.b.srem(k, integer(3))
+            numbers = f.at(corner, f.b.mul(row, line), f.times(column, 4 * inputs))
+            weights = f.at(kernel, f.times(k, across * layer.all_inputs), across * before)
 
-        def some(m, sums):
-            here = f.at(numbers, f.times(m, 4 * steps))
-            there = f.at(kernel, weights, f.times(m, 4 * steps * outputs))
-            for step in range(steps):
-                by = [
-                    f.load_unaligned(VECTOR, there, 4 * step * outputs + v * VECTOR_BYTES)
-                    for v in range(lanes)
-                ]
-                for n in range(pixels):
-                    number = f.splat(f.load(FLOAT, here, 4 * (n * inputs + step)))
-                    for v in range(lanes):
-                        sums[n * lanes + v] = f.fma(number, by[v], sums[n * lanes + v])
-            return sums
+            def some(m, sums):
+                here = f.at(numbers, f.times(m, 4 * steps))
+                there = f.at(weights, f.times(m, steps * across))
+                for step in range(steps):
+                    by = [
+                        f.load_unaligned(VECTOR, there, step * across + v * VECTOR_BYTES)
+                        for v in range(together)
+                    ]
+                    for n in range(layer.pixels):
+                        number = f.splat(f.load(FLOAT, here, 4 * (n * inputs + step)))
+                        for v in range(together):
+                            place = n * together + v
+                            sums[place] = f.fma(number, by[v], sums[place])
+                return sums
 
-        return f.loop(0, across // steps, some, sums)
+            return f.loop(0, inputs // steps, some, sums)
 
-    sums = f.loop(0, 3, row, [vector(0)] * (pixels * lanes))
+        sums = f.loop(0, 9, tap, sums)
+        before += inputs
     for i, value in enumerate(sums):
-        n, v = divmod(i, lanes)
-        f.store_unaligned(value, target, 4 * n * outputs + v * VECTOR_BYTES)
+        n, v = divmod(i, together)
+        value = ACTIVATIONS[activations[v]](f, value)
+        f.store_unaligned(value, targets[v], 4 * n * layer.outputs)
     f.b.ret_void()
     return f.function
 
 
-def _convolution(module: Module, height: int, width: int, inputs: int, outputs: int) -> Code:
+def _convolution(module: Module, layer: Layer) -> Code:
     """Some rows of the result. Where a block ends with the image, zeros are put around it first."""
     f = Function(module, "convolution", [POINTER, INT, INT])
     pointers, image, part = f.arguments
-    source, kernel, target = _pointers(f, pointers, 3)
-    room = 28 if vectors() == 32 else 6  # sums in registers, beside what is added to them
-    lanes = 2 if outputs % (2 * LANES) == 0 else 1
-    pixels = _width_of_block(width, room // lanes)
-    block = _block(module, pixels, inputs, outputs, lanes)
-    pixel, line = 4 * inputs, 4 * inputs * width
-    enclosed_line = (pixels + 2) * pixel
-    enclosed = f.alloca(3 * enclosed_line)
-    source = f.at(source, f.times(image, height * line))
-    target = f.at(target, f.times(image, 4 * height * width * outputs))
+    height, width, pixels = layer.height, layer.width, layer.pixels
+    maps, results = len(layer.inputs), len(layer.activations)
+    arrays = _pointers(f, pointers, maps + 1 + layer.has_bias + results)
+    lines = [4 * inputs * width for inputs in layer.inputs]
+    sources = [
+        f.at(array, f.times(image, height * line))
+        for array, line in zip(arrays[:maps], lines, strict=True)
+    ]
+    kernel, bias = arrays[maps], arrays[maps + layer.has_bias]
+    targets = [
+        f.at(array, f.times(image, 4 * height * width * layer.outputs))
+        for array in arrays[-results:]
+    ]
+    enclosed = [f.alloca(3 * layer.enclosed_line(inputs)) for inputs in layer.inputs]
+    record = f.alloca(8 * (2 * maps + 2 + layer.together))
+    # Which result, and how many bytes into its pixels, for each vector of outputs.
+    lanes = [
+        (result, lane * VECTOR_BYTES)
+        for result in range(results)
+        for lane in range(layer.outputs // LANES)
+    ]
+    groups = [lanes[i : i + layer.together] for i in range(0, len(lanes), layer.together)]
+    code = {}
+    for group in groups:
+        key = tuple(layer.activations[result] for result, _ in group)
+        if key not in code:
+            code[key] = _block(module, layer, key)
 
-    def enclose(y, left):
-        f.memset(enclosed, 3 * enclosed_line)
+    def enclose(source, target, inputs, y, left):
+        pixel, line, whole = 4 * inputs, 4 * inputs * width, layer.enclosed_line(inputs)
+        f.memset(target, 3 * whole)
         start = _between(f, f.b.sub(left, integer(1)), 0, width)
         stop = _between(f, f.b.add(left, integer(pixels + 1)), 0, width)
         skipped = f.b.add(f.b.sub(start, left), integer(1))
@@ -126,7 +200,7 @@ def _convolution(module: Module, height: int, width: int, inputs: int, outputs: 
             inside = f.b.and_(f.less(-1, here), f.less(here, height))
             with f.b.if_then(inside):
                 f.memcpy(
-                    f.at(enclosed, f.times(i, enclosed_line), f.times(skipped, pixel)),
+                    f.at(target, f.times(i, whole), f.times(skipped, pixel)),
                     f.at(source, f.times(here, line), f.times(start, pixel)),
                     f.times(f.b.sub(stop, start), pixel),
                 )
@@ -142,17 +216,23 @@ def _convolution(module: Module, height: int, width: int, inputs: int, outputs: 
             inside = f.b.and_(f.less(0, left), f.less(left, width - pixels))
             inside = f.b.and_(inside, is_inside)
             with f.b.if_then(f.b.not_(inside)):
-                enclose(y, left)
-            corner = f.at(source, f.times(y, line), f.times(left, pixel), -line - pixel)
-            corner = f.b.select(inside, corner, enclosed)
-            stride = f.b.select(inside, integer(line), integer(enclosed_line))
-            there = f.at(target, f.times(f.b.add(f.times(y, width), left), 4 * outputs))
-
-            def of_lanes(v, _):
-                first = f.times(v, lanes * VECTOR_BYTES)
-                f.b.call(block, [corner, stride, f.at(kernel, first), f.at(there, first)])
-
-            f.loop(0, outputs // (lanes * LANES), of_lanes)
+                for source, target, inputs in zip(sources, enclosed, layer.inputs, strict=True):
+                    enclose(source, target, inputs, y, left)
+            for i, inputs in enumerate(layer.inputs):
+                corner = f.at(sources[i], f.times(y, lines[i]), f.times(left, 4 * inputs))
+                corner = f.at(corner, -lines[i] - 4 * inputs)
+                line = f.b.select(inside, integer(lines[i]), integer(layer.enclosed_line(inputs)))
+                f.store(f.b.select(inside, corner, enclosed[i]), record, 16 * i)
+                f.store(line, record, 16 * i + 8)
+            there = f.times(f.b.add(f.times(y, width), left), 4 * layer.outputs)
+            for i, group in enumerate(groups):
+                first = i * layer.together * VECTOR_BYTES
+                fields = [f.at(kernel, first), f.at(bias, first)]
+                fields += [f.at(targets[result], there, lane) for result, lane in group]
+                for k, field in enumerate(fields):
+                    f.store(field, record, 8 * (2 * maps + k))
+                key = tuple(layer.activations[result] for result, _ in group)
+                f.b.call(code[key], [record])
 
         f.loop(0, -(-width // pixels), of_block)
 
@@ -161,24 +241,38 @@ def _convolution(module: Module, height: int, width: int, inputs: int, outputs: 
     return f.function
 
 
-def _make_convolution(height: int, width: int, inputs: int, outputs: int) -> str:
+def _make_convolution(*layer) -> str:
+    layer = Layer(*layer)
     module = Module()
-    stage = _convolution(module, height, width, inputs, outputs)
-    name = f"firenet_convolution_{height}_{width}_{inputs}_{outputs}"
-    register(name, module, [stage], _parts(height), 2, [0])
+    stage = _convolution(module, layer)
+    inputs = "_".join(map(str, layer.inputs))
+    results = "_".join(layer.activations) + f"_{layer.outputs}" + "_bias" * layer.has_bias
+    name = f"firenet_convolution_{layer.height}_{layer.width}_{inputs}_{results}"
+    arguments = len(layer.inputs) + 1 + layer.has_bias
+    register(
+        name, module, [stage], _parts(layer.height), arguments, list(range(len(layer.activations)))
+    )
     return name
 
 
-# --- The gradient with respect to the kernel ---------------------------------------------------
+# --- The gradients of kernel and bias ----------------------------------------------------------
 
 
-def _products(module: Module, width: int, inputs: int, outputs: int, group: int) -> Code:
+def _products(
+    module: Module,
+    width: int,
+    inputs: int,
+    outputs: int,
+    of_map: int,
+    group: int,
+    of_gradient: int,
+) -> Code:
     """products(row of the image, row of the gradient, sums): added to three columns of the kernel.
 
     A pixel of the image meets the gradients of its three neighbours in the row; the sums of `group`
     inputs with 16 outputs stay in registers on the way through it.
     """
-    f = Function(module, f"products{group}", [POINTER, POINTER, POINTER])
+    f = Function(module, f"products{of_map}_{group}_{of_gradient}", [POINTER] * 3)
     f.function.attributes.add("noinline")
     pixels, gradients, sums = f.arguments
 
@@ -190,7 +284,7 @@ def _products(module: Module, width: int, inputs: int, outputs: int, group: int)
 
     def add(x, three, values):
         """three: the gradients to the right of this pixel, here, and to the left."""
-        here = f.at(pixels, f.times(x, 4 * inputs))
+        here = f.at(pixels, f.times(x, 4 * of_map))
         for c in range(group):
             number = f.splat(f.load(FLOAT, here, 4 * c))
             for j in range(3):
@@ -199,7 +293,7 @@ def _products(module: Module, width: int, inputs: int, outputs: int, group: int)
 
     def pixel(x, carried):
         here, left, *values = carried
-        right = f.load_unaligned(VECTOR, gradients, f.times(x, 4 * outputs), 4 * outputs)
+        right = f.load_unaligned(VECTOR, gradients, f.times(x, 4 * of_gradient), 4 * of_gradient)
         return [right, here, *add(x, (right, here, left), values)]
 
     carried = [f.load_unaligned(VECTOR, gradients), vector(0), *values]
@@ -213,53 +307,87 @@ def _products(module: Module, width: int, inputs: int, outputs: int, group: int)
     return f.function
 
 
-def _sums(module: Module, height: int, width: int, inputs: int, outputs: int) -> Code:
-    """Of some rows of an image: its own sums, all of the kernel's gradient."""
+def _sums(module: Module, height: int, width: int, maps: tuple, gradients: tuple) -> Code:
+    """Of some rows of an image: its own sums, all of the kernel's gradient and the bias's."""
     f = Function(module, "sums", [POINTER, INT, INT])
     pointers, image, part = f.arguments
-    source, gradient, partial = _pointers(f, pointers, 3)
-    whole = 4 * 9 * inputs * outputs
+    arrays = _pointers(f, pointers, len(maps) + len(gradients) + 1)
+    arrays, partial = arrays[:-1], arrays[-1]
+    arrays = [
+        f.at(array, f.times(image, 4 * height * width * channels))
+        for array, channels in zip(arrays, maps + gradients, strict=True)
+    ]
+    sources, there = arrays[: len(maps)], arrays[len(maps) :]
+    inputs, outputs = sum(maps), sum(gradients)
+    kernel = 4 * 9 * inputs * outputs
+    whole = kernel + 4 * outputs
     index = f.b.add(f.times(image, _parts(height)), part)
     partial = f.at(partial, f.times(index, whole))
-    source = f.at(source, f.times(image, 4 * height * width * inputs))
-    gradient = f.at(gradient, f.times(image, 4 * height * width * outputs))
     f.memset(partial, whole)
     most = GROUP if vectors() == 32 else 2
-    groups = [(c, min(most, inputs - c)) for c in range(0, inputs, most)]
-    sizes = sorted({group for _, group in groups})
-    code = {group: _products(module, width, inputs, outputs, group) for group in sizes}
+    code = {}
     first, last = _rows(f, part, height)
 
-    def of_kernel_row(i, _):
-        shift = f.b.sub(i, integer(1))
+    def products(pixels, c, of_map, gradient, lane, of_gradient, sums):
+        """Of some channels of a map and a vector of a gradient, for all rows of the kernel."""
+        group = min(most, of_map - c)
+        key = of_map, group, of_gradient
+        if key not in code:
+            code[key] = _products(module, width, inputs, outputs, *key)
 
-        def of_lanes(v, _):
-            lanes = f.times(v, VECTOR_BYTES)
-            for c, group in groups:
-                there = f.at(partial, f.times(i, 4 * 3 * inputs * outputs), lanes, 4 * c * outputs)
+        def of_kernel_row(i, _):
+            def of_row(y, _):
+                above = f.b.add(y, f.b.sub(i, integer(1)))
+                with f.b.if_then(f.b.and_(f.less(-1, above), f.less(above, height))):
+                    here = f.at(pixels, f.times(above, 4 * width * of_map), 4 * c)
+                    beside = f.at(gradient, f.times(y, 4 * width * of_gradient), lane)
+                    rows = f.at(sums, f.times(i, 4 * 3 * inputs * outputs))
+                    f.b.call(code[key], [here, beside, rows])
 
-                def of_row(y, _, c=c, group=group, there=there):
-                    above = f.b.add(y, shift)
-                    with f.b.if_then(f.b.and_(f.less(-1, above), f.less(above, height))):
-                        pixels = f.at(source, f.times(above, 4 * width * inputs), 4 * c)
-                        gradients = f.at(gradient, f.times(y, 4 * width * outputs), lanes)
-                        f.b.call(code[group], [pixels, gradients, there])
+            f.loop(first, last, of_row)
 
-                f.loop(first, last, of_row)
+        f.loop(0, 3, of_kernel_row)
 
-        f.loop(0, outputs // LANES, of_lanes)
+    def of_bias(gradient, lane, of_gradient, target):
+        def of_row(y, total):
+            row = f.at(gradient, f.times(y, 4 * width * of_gradient), lane)
 
-    f.loop(0, 3, of_kernel_row)
+            def add(x, total):
+                here = f.load_unaligned(VECTOR, row, f.times(x, 4 * of_gradient))
+                return [f.b.fadd(total[0], here)]
+
+            return f.loop(0, width, add, total)
+
+        f.store_unaligned(f.loop(first, last, of_row, [vector(0)])[0], target)
+
+    column = kernel
+    for gradient, of_gradient in zip(there, gradients, strict=True):
+        for lane in range(0, 4 * of_gradient, VECTOR_BYTES):
+            of_bias(gradient, lane, of_gradient, f.at(partial, column + lane))
+        column += 4 * of_gradient
+    before = 0
+    for pixels, of_map in zip(sources, maps, strict=True):
+        for c in range(0, of_map, most):
+            column = 0
+            for gradient, of_gradient in zip(there, gradients, strict=True):
+                for lane in range(0, 4 * of_gradient, VECTOR_BYTES):
+                    sums = f.at(partial, 4 * (before + c) * outputs + 4 * column + lane)
+                    products(pixels, c, of_map, gradient, lane, of_gradient, sums)
+                column += of_gradient
+        before += of_map
     f.b.ret_void()
     return f.function
 
 
-def _total(module: Module, batch: int, height: int, inputs: int, outputs: int) -> Code:
-    """Some of the kernel's gradient: the sums of all parts of all images."""
+def _total(module: Module, batch: int, height: int, arrays: int, numbers: int) -> Code:
+    """Some of these gradients, of so many numbers: the sums of all parts of all images.
+
+    arrays: how many come before these sums.
+    """
     f = Function(module, "total", [POINTER, INT, INT])
     pointers, image, part = f.arguments
-    _, _, partial, result = _pointers(f, pointers, 4)
-    count, whole = batch * _parts(height), 9 * inputs * outputs // LANES
+    partial, result = _pointers(f, pointers, arrays + 2)[arrays:]
+    count, whole = batch * _parts(height), numbers // LANES
     each = -(-whole // count)
     index = f.b.add(f.times(image, _parts(height)), part)
     first = f.times(index, each)
@@ -280,53 +408,68 @@ def _total(module: Module, batch: int, height: int, inputs: int, outputs: int) -
     return f.function
 
 
-def _make_gradient(batch: int, height: int, width: int, inputs: int, outputs: int) -> str:
+def _make_gradient(batch: int, height: int, width: int, maps: tuple, gradients: tuple) -> str:
     module = Module()
+    arrays = len(maps) + len(gradients)
     stages = [
-        _sums(module, height, width, inputs, outputs),
-        _total(module, batch, height, inputs, outputs),
+        _sums(module, height, width, maps, gradients),
+        _total(module, batch, height, arrays, (9 * sum(maps) + 1) * sum(gradients)),
     ]
-    name = f"firenet_kernel_gradient_{batch}_{height}_{width}_{inputs}_{outputs}"
-    register(name, module, stages, _parts(height), 2, [0, 1])
+    sizes = "_".join(map(str, (batch, height, width, *maps, "by", *gradients)))
+    name = f"firenet_kernel_gradient_{sizes}"
+    register(name, module, stages, _parts(height), arrays, [0, 1])
     return name
 
 
 # --- To JAX ------------------------------------------------------------------------------------
 
 
-def convolve(image: jax.Array, kernel: jax.Array) -> jax.Array:
-    """(B, H, W, I), (3, 3, I, O) -> (B, H, W, O); raises Unavailable where there is none of it."""
-    _check(image, kernel)
-    batch, height, width, inputs = image.shape
-    outputs = kernel.shape[3]
+def convolve(
+    maps: Sequence[jax.Array],
+    kernel: jax.Array,
+    bias: jax.Array | None = None,
+    activations: tuple[str, ...] = ("none",),
+) -> list[jax.Array]:
+    """Maps (B, H, W, .), seen as one of I channels, (3, 3, I, O), (O,) -> as many maps as names.
+
+    activations: none, relu, sigmoid, tanh: one for each of the equal parts of the outputs.
+    Raises Unavailable for what it does not compute, where XLA must.
+    """
+    _check(kernel, *maps, *(() if bias is None else (bias,)))
+    batch, height, width, _ = maps[0].shape
+    outputs, odd = divmod(kernel.shape[3], len(activations))
+    if odd or outputs % LANES:
+        raise Unavailable
+    inputs = tuple(x.shape[3] for x in maps)
+    layer = Layer(height, width, inputs, activations, outputs, bias is not None)
+    shape = jax.ShapeDtypeStruct((batch, height, width, outputs), jnp.float32)
     call = jax.ffi.ffi_call(
-        made(_make_convolution, height, width, inputs, outputs),
-        jax.ShapeDtypeStruct((batch, height, width, outputs), jnp.float32),
+        made(_make_convolution, *layer), [shape] * len(activations), vmap_method="sequential"
+    )
+    return list(call(*maps, kernel, *(() if bias is None else (bias,))))
+
+
+def gradients(
+    maps: Sequence[jax.Array], kernel: jax.Array, changes: Sequence[jax.Array]
+) -> tuple[jax.Array, jax.Array]:
+    """Maps (B, H, W, .), (3, 3, I, O), the sums' gradients -> those of kernel and bias (O,)."""
+    _check(kernel, *maps, *changes)
+    batch, height, width, _ = maps[0].shape
+    channels = [tuple(x.shape[3] for x in arrays) for arrays in (maps, changes)]
+    if any(outputs % LANES for outputs in channels[1]):
+        raise Unavailable
+    numbers = kernel.size + kernel.shape[3]
+    shapes = (batch * _parts(height), numbers), (numbers,)
+    call = jax.ffi.ffi_call(
+        made(_make_gradient, batch, height, width, *channels),
+        [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes],
         vmap_method="sequential",
     )
-    return call(image, kernel)
+    both = call(*maps, *changes)[1]
+    return both[: kernel.size].reshape(kernel.shape), both[kernel.size :]
 
 
-def kernel_gradient(image: jax.Array, kernel: jax.Array, gradient: jax.Array) -> jax.Array:
-    """(B, H, W, I), (3, 3, I, O), (B, H, W, O) -> (3, 3, I, O)."""
-    _check(image, kernel, gradient)
-    batch, height, width, inputs = image.shape
-    outputs = kernel.shape[3]
-    partial = batch * _parts(height), 9 * inputs * outputs
-    call = jax.ffi.ffi_call(
-        made(_make_gradient, batch, height, width, inputs, outputs),
-        [
-            jax.ShapeDtypeStruct(partial, jnp.float32),
-            jax.ShapeDtypeStruct(kernel.shape, jnp.float32),
-        ],
-        vmap_method="sequential",
-    )
-    return call(image, gradient)[1]
-
-
-def _check(image: jax.Array, kernel: jax.Array, *others: jax.Array) -> None:
-    rows, columns, inputs, outputs = kernel.shape
-    is_ours = (rows, columns) == (3, 3) and inputs == image.shape[-1] and outputs % LANES == 0
-    arrays = image, kernel, *others
-    if vectors() == 0 or not is_ours or any(x.size == 0 or x.dtype != jnp.float32 for x in arrays):
+def _check(kernel: jax.Array, *arrays: jax.Array) -> None:
+    is_ours = all(x.size and x.dtype == jnp.float32 for x in (kernel, *arrays))
+    if vectors() == 0 or kernel.shape[:2] != (3, 3) or not is_ours:
         raise Unavailable
