@@ -99,8 +99,9 @@ class Evaluate:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """A folder, for index.html, table.csv and results.json. An evaluation that was interrupted
     goes on there, and one with more data or methods uses what is there."""
-    methods: str = "firenet,e2vid,hf,mr"
-    """Of firenet, e2vid, hf (high-pass filter) and mr (manifold regularisation), with commas."""
+    methods: str | None = None
+    """Of firenet, e2vid, hf (high-pass filter) and mr (manifold regularisation), with commas.
+    Without: all, e2vid only with weights."""
     weights: Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-c"])] = ()
     """Weights of FireNet or FireNet+: each file is a method named after it. Without any: those
     that come with the package, which are named built-in."""
@@ -159,6 +160,9 @@ class Evaluate:
 
     @property
     def method_names(self) -> list[str]:
+        if self.methods is None:
+            e2vid = ["e2vid"] if self.e2vid_weights or self.e2vid_random else []
+            return ["firenet", *e2vid, "hf", "mr"]
         return [name.strip() for name in self.methods.split(",") if name.strip()]
 
     @property

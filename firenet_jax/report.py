@@ -8,6 +8,7 @@ style; it loads no script and nothing from elsewhere.
 
 import base64
 import csv
+import datetime
 import io
 import math
 from collections.abc import Iterator, Sequence
@@ -110,7 +111,10 @@ def table(results: dict) -> str:
     """For a terminal."""
     shown = columns(results)
     lines, last = [["", "", "frames", *(METRICS[name].title for name in shown)]], None
+    single = len(results["sequences"]) == 1  # of which a mean says the same again
     for sequence, method, count, entry in rows_of(results):
+        if single and sequence not in results["sequences"]:
+            continue
         cells = [entry["gap"]] if "gap" in entry else [cell(entry, name) for name in shown]
         lines.append(["" if sequence == last else sequence, method, count, *cells])
         last = sequence
@@ -191,15 +195,19 @@ def page(results: dict, shown: dict[str, Shown]) -> str:
         "<h1>Reconstructions beside camera frames</h1>",
         f"<p>Sequences: {len(sequences)}. Methods: {escape(', '.join(colours))}. The best number "
         "of each column is marked. Pictures are shown as they were compared.</p>",
+        f"<p>{escape(made(results))}</p>",
     ]
     for kind, title in (
         ("over sequences", "Mean over sequences"),
         ("over frames", "Mean over frames"),
     ):
+        if len(sequences) == 1:  # the mean of one says the same again
+            continue
         parts.append(
             f"<div class=wide>{_table(results, results['means'][kind], colours, title)}</div>"
         )
-    parts.append("<ul>" + "".join(f"<li>{escape(note)}</li>" for note in notes(results)) + "</ul>")
+    said = [*(f"{name}: {about(name)}" for name in results["methods"]), *notes(results)]
+    parts.append("<ul>" + "".join(f"<li>{escape(note)}</li>" for note in said) + "</ul>")
     links = (f'<a href="#{_anchor(k)}">{escape(name)}</a>' for k, name in enumerate(sequences))
     parts.append(f"<nav>{''.join(links)}</nav>")
     for number, (name, facts) in enumerate(sequences.items()):
@@ -214,6 +222,26 @@ def page(results: dict, shown: dict[str, Shown]) -> str:
         parts += [_curves(facts["methods"], colours), "</section>"]
     parts.append("</body></html>\n")
     return "\n".join(part for part in parts if part)
+
+
+def about(method: str) -> str:
+    """What a method is, for people who read its name in a table."""
+    known = {
+        "hf": "high-pass filter (Scheerlinck et al. 2018), not learned",
+        "mr": "manifold regularisation (Reinbacher et al. 2016), not learned",
+        "e2vid": "E2VID (Rebecq et al. 2019), from its checkpoint",
+        "e2vid-random": "E2VID with random weights: its images mean nothing",
+        "built-in": "FireNet (Scheerlinck et al. 2020), the weights of this package",
+    }
+    return known.get(method, "FireNet (Scheerlinck et al. 2020) with the weights of this name")
+
+
+def made(results: dict) -> str:
+    """When, by which version, with which settings."""
+    settings = results.get("settings", {})
+    chosen = [f"{k} {v}" for k, v in settings.items() if v is not None and k != "version"]
+    today = datetime.date.today().isoformat()
+    return f"{today}, firenet_jax {settings.get('version', '')}; settings: {', '.join(chosen)}."
 
 
 def _anchor(number: int) -> str:

@@ -30,6 +30,7 @@ MAGIC = b"#!AER-DAT4.0\r\n"
 CODECS = {0: None, 1: "lz4", 2: "lz4", 3: "zstd", 4: "zstd"}
 HEADER = 1 << 24  # bytes of a header at most
 PACKET = 1 << 28  # bytes of an unpacked packet at most: 16 million events
+PIECE = 1 << 20
 HEAD = 1 << 10  # bytes of a frame in which all but its pixels lies
 EVENT = np.dtype(
     {
@@ -185,10 +186,19 @@ def _unpacked(file: BinaryIO, layout: Layout, place: int, size: int, most: int =
     data = file.read(size)
     if layout.codec:
         with pa.CompressedInputStream(pa.BufferReader(data), layout.codec) as stream:
-            data = stream.read(most + 1)
+            data = up_to(stream, most + 1)
     if len(data) > most and most == PACKET:
         raise ValueError(f"more than {PACKET >> 20} MB unpacked")
     return data[4:]
+
+
+def up_to(stream, most: int) -> bytes:
+    """So many bytes at most, piece by piece: a stream of pyarrow makes room for all it is asked."""
+    pieces, missing = [], most
+    while missing and (piece := stream.read(min(missing, PIECE))):
+        pieces.append(piece)
+        missing -= len(piece)
+    return b"".join(pieces)
 
 
 def _events(path: Path, layout: Layout) -> Iterator[Events | Rows]:

@@ -17,6 +17,8 @@ from typing import BinaryIO, NamedTuple
 
 import pyarrow as pa
 
+from firenet_jax.readers.aedat4 import up_to
+
 MAGIC = b"#ROSBAG V2.0\n"
 CHUNK, CONNECTION, MESSAGE = 5, 7, 2
 LARGEST = 1 << 28  # bytes of a record, as it is in the file and unpacked
@@ -107,5 +109,5 @@ def _unpacked(data: bytes, how: bytes) -> bytes:
         return bz2.BZ2Decompressor().decompress(data, LARGEST)
     if how == b"lz4":
         with pa.CompressedInputStream(pa.BufferReader(data), "lz4") as stream:
-            return stream.read(LARGEST)
+            return up_to(stream, LARGEST)
     raise ValueError(f"a chunk compressed by {how!r}")
