@@ -5,7 +5,7 @@
 WEIGHTS: "built-in", and files of others (the published checkpoint, FireNet+, ...); a name may be
 given, ours=PATH. The questions, each a function, an entry of results/endurance.json and a table:
 
-    long        16 simulated sequences of 1,000 windows, clean and faulty: SSIM, MSE and brightness
+    long        simulated sequences of 1,000 windows, clean and faulty: SSIM, MSE and brightness
                 while young and old. A network that remembers well looks the same at every age.
     rest        ten windows, then a thousand with nothing, or with noise: does what was seen stay,
                 and where does the image drift?
@@ -111,7 +111,7 @@ def correlation(a: np.ndarray, b: np.ndarray) -> float:
 # ---- Simulated
 
 
-def long(methods: Methods, sequences: int = 16) -> list[dict]:
+def long(methods: Methods, sequences: int) -> list[dict]:
     found = {}
     pictures, scene = textures(), SceneSettings(speed=(20.0, 200.0))
     for sensor in SENSORS:
@@ -143,15 +143,20 @@ def long(methods: Methods, sequences: int = 16) -> list[dict]:
     ]
 
 
-def rest(methods: Methods, batch: int = 2) -> list[dict]:
+def rest(methods: Methods, sequences: int) -> list[dict]:
     """Noise is balanced, ON and OFF as probable, uniform in time and place."""
     pictures, rows = textures(), []
     setup = random_setups(
-        jax.random.key(5), pictures, batch=batch, windows=10, scene=SceneSettings(pause=0.0), **SIZE
+        jax.random.key(5),
+        pictures,
+        batch=sequences,
+        windows=10,
+        scene=SceneSettings(pause=0.0),
+        **SIZE,
     )
     data = simulate(*setup[:2], window_bounds(setup[2], 10), **SIZE)[1]
 
-    shape = CHUNK, batch, *SIZE.values(), 5
+    shape = CHUNK, sequences, *SIZE.values(), 5
 
     @partial(jax.jit, static_argnames="noise")
     def resting(key, noise: float):
@@ -163,7 +168,7 @@ def rest(methods: Methods, batch: int = 2) -> list[dict]:
         states, found = {}, {}
         for name, weights in methods.items():
             states[name], images = reconstruct(
-                weights, initial_state(batch, *SIZE.values()), data.tensors
+                weights, initial_state(sequences, *SIZE.values()), data.tensors
             )
             found[name] = {0: np.asarray(images[-1])}
         for first in range(0, RESTED[-1], CHUNK):
@@ -204,7 +209,7 @@ def _rates(sensors, scenes, durations, windows, *, height, width, renderings=64)
     return count / (height * width) / (renderings / 8)
 
 
-def density(methods: Methods, batches: int = 2) -> list[dict]:
+def density(methods: Methods, sequences: int) -> list[dict]:
     pictures, rows = textures(), []
     windows = WARM + JUDGED
     for sensor in SENSORS:
@@ -212,7 +217,7 @@ def density(methods: Methods, batches: int = 2) -> list[dict]:
             scene = SceneSettings(speed=SPEEDS[speed], pause=0.0)
             for wanted in DENSITIES:
                 found = {name: [] for name in methods}
-                for n in range(batches):
+                for n in range(sequences // BATCH):
                     make = partial(
                         random_setups, jax.random.key(n), pictures, batch=BATCH, scene=scene,
                         sensor=SENSORS[sensor], **SIZE,
@@ -358,7 +363,6 @@ def frames(methods: Methods, recordings: list[Path]) -> list[dict]:
 # ---- All of it
 
 SIMULATED = {"long": long, "rest": rest, "density": density}
-QUICK = {"long": 4, "rest": 1, "density": 1}
 RECORDED = {"palindrome": palindrome, "frames": frames, "contrast": contrast}
 
 
@@ -386,7 +390,7 @@ def main():
     parser.add_argument("weights", nargs="+", help="built-in, FILE or NAME=FILE")
     parser.add_argument("--recordings", type=Path, help="a folder of them")
     parser.add_argument("--only", nargs="*", default=[*SIMULATED, *RECORDED])
-    parser.add_argument("--quick", action="store_true", help="fewer sequences; writes nothing")
+    parser.add_argument("--sequences", type=int, default=16, help="simulated, of each condition")
     options = parser.parse_args()
     files = {}
     for each in options.weights:
@@ -402,15 +406,15 @@ def main():
         if name not in options.only or (name in RECORDED and not recordings):
             continue
         if name in SIMULATED:
-            rows = function(methods, QUICK[name]) if options.quick else function(methods)
+            rows = function(methods, options.sequences)
+            rows = [{**row, "sequences": options.sequences} for row in rows]
         else:
             rows = function(files if function is contrast else methods, recordings)
         print(f"\n{name}")
         table(rows)
         others = [row for row in results.get(name, []) if row["weights"] not in methods]
         results[name] = others + rows
-        if not options.quick:
-            save("endurance", results)
+        save("endurance", results)
 
 
 if __name__ == "__main__":

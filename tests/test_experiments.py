@@ -22,7 +22,7 @@ SMALL = {
     "colour_mosaic": "--windows 4",
     "compare_losses": "{folder}/runs --steps 1 --only l1",
     "compare_optimisers": "{folder}/runs --steps 1 --only 'muon, rate 3e-3'",
-    "endurance": f"{WEIGHTS} --recordings {{folder}} --only palindrome contrast --quick",
+    "endurance": f"{WEIGHTS} --recordings {{folder}} --only palindrome contrast",
     "figure3_qualitative": "--seconds 0.2",
     "figure4_high_speed": "--seconds 0.1 --windows 4",
     "figure5_recurrence": "--seconds 0.2",
