@@ -61,6 +61,7 @@ from pytorch_firenet import (
 
 from firenet_jax.events import Events
 from firenet_jax.losses import Loss
+from firenet_jax.native import by_xla_alone
 from firenet_jax.network import (
     Weights,
     initial_params,
@@ -184,7 +185,11 @@ def step_makers(width: int, height: int, batch: int) -> Makers:
         return lambda: jax.block_until_ready(run())[1][0]
 
     def xla_scan():
-        run = jax.jit(partial(jax.lax.scan, partial(step, params)))
+        @jax.jit
+        def run(state, tensors):
+            with by_xla_alone():
+                return jax.lax.scan(partial(step, params), state, tensors)
+
         return lambda: jax.block_until_ready(run(state, tensors))[1][0]
 
     def torch_step(make, memory_format, dtype=torch.float32):
