@@ -49,10 +49,7 @@ def check_seed(seed: int) -> None:
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """What random scenes look like. Pairs are (least, greatest).
-
-    Raises ValueError for numbers that no scene has.
-    """
+    """What random scenes look like. Pairs are (least, greatest)."""
 
     objects: int = 3
     """Objects before the background; a scene shows between none and all of them."""
@@ -91,6 +88,7 @@ class SceneSettings:
     """How probable it is that a scene lies partly in deep shadow, 10 to 100 times darker."""
 
     def __post_init__(self):
+        """Raises ValueError for numbers that no scene has."""
         for name in ("speed", "zoom", "blur", "size", "softness", "gamma"):
             check_range(name, getattr(self, name))
         for name in ("pause", "halt", "still", "plain", "hdr"):

@@ -55,9 +55,7 @@ def _on(fault: float | tuple[float, float] | None) -> bool:
 class SensorSettings:
     """The sensor; as it stands the paper's, without faults. Pairs are (least, greatest), drawn
     log-uniformly for each sequence. A fault is off where it is 0, (0, 0) or None, which is 0 unless
-    all faults are asked for (`with_faults`).
-
-    Raises ValueError for numbers that no sensor has.
+    all faults are asked for.
     """
 
     threshold: float | None = None
@@ -93,6 +91,7 @@ class SensorSettings:
     first rendering, instead of on it."""
 
     def __post_init__(self):
+        """Raises ValueError for numbers that no sensor has."""
         for name in ("threshold_range", "refractory_range"):
             if getattr(self, name) is not None:
                 check_range(name, getattr(self, name))
