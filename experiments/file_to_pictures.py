@@ -87,7 +87,11 @@ def stages(recording: Path, folder: Path) -> dict:
 
     def reading() -> list:
         job = Job(open_recording(recording), folder / "none", "", WINDOWS)
-        return list(in_chunks([job], settings, slots=1, devices=1, failed={}, writers={}))
+        writers = {}
+        chunks = list(in_chunks([job], settings, 1, 1, failed={}, writers=writers))
+        for writer in writers.values():  # which was opened and locked its folder
+            writer.abandon()
+        return chunks
 
     chunks = reading()
 
