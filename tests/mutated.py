@@ -276,6 +276,8 @@ def run(seed: int, first: int, count: int) -> tuple[collections.Counter, list[st
             if number % 1000 == 0:
                 print(number, dict(counts), file=sys.stderr, flush=True)
         code = worker.wait()
+        watch.close()
+        worker.stdout.close()
         if number < end:
             counts["FAULT"] += 1
             faults.append(f"{last}: {what} (exit {code})")
