@@ -105,7 +105,7 @@ def test_preview_of_colours():
 
 def test_a_red_bar_is_red():
     """Red pixels see a bright bar pass over black ground, green and blue ones see nothing."""
-    height, width, count = 32, 48, 40
+    height, width, count = 32, 64, 40
     sensor = random_sensor(jax.random.key(0), height=height, width=width)
 
     def rendering(t):
@@ -123,7 +123,7 @@ def test_a_red_bar_is_red():
     )  # fmt: skip
     red, green, blue = np.moveaxis(np.asarray(pictures[-1, 0], int), -1, 0)
     bar = slice(4, -4), slice(count - 9, count - 3)
-    before = slice(4, -4), slice(count + 2, -2)
+    before = slice(4, -4), slice(count + 10, -2)  # beyond the halo of the bar
     assert min((red - green)[bar].mean(), (red - blue)[bar].mean()) > 15
     assert abs((red - blue)[before].mean()) < 15
 
