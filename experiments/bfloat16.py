@@ -15,7 +15,7 @@ from harness import save
 from skimage.metrics import structural_similarity
 
 import firenet_jax as fj
-from firenet_jax.info import describe
+from firenet_jax.commands.info import describe
 
 
 def compare(weights, path: Path, windows: int) -> dict:

@@ -24,7 +24,7 @@ from firenet_jax.checkpoint import load_weights
 from firenet_jax.colour import CORNERS, to_lab
 from firenet_jax.events import concatenate
 from firenet_jax.reconstruction import Network, events_to_pictures, initial_session
-from firenet_jax.sensor import event_list, random_sensor
+from firenet_jax.simulation.sensor import event_list, random_sensor
 from firenet_jax.tensors import pack
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -21,15 +21,15 @@ from harness import save
 from PIL import Image
 from train_default import REAL as SETTINGS
 
-from firenet_jax import metrics
 from firenet_jax.checkpoint import load_weights
-from firenet_jax.equalise import equalise
-from firenet_jax.losses import Loss
+from firenet_jax.evaluation import metrics
+from firenet_jax.evaluation.equalise import equalise
 from firenet_jax.network import initial_state
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.sensor import sequences
-from firenet_jax.textures import HELD_OUT, load_textures, photographs
-from firenet_jax.train import run
+from firenet_jax.simulation.sensor import sequences
+from firenet_jax.simulation.textures import HELD_OUT, load_textures, photographs
+from firenet_jax.training.losses import Loss
+from firenet_jax.training.run import run
 
 NONE = Loss(l1=0, nlpd=0, haarpsi=0)
 # Weights that should bring each sum near the default's, so that lambda_tc means the same.

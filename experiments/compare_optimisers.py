@@ -17,7 +17,7 @@ import matplotlib
 from harness import RESULTS, save
 from train_default import REAL
 
-from firenet_jax.train import run
+from firenet_jax.training.run import run
 
 matplotlib.use("agg")
 from matplotlib import pyplot as plt  # noqa: E402

@@ -35,13 +35,13 @@ from PIL import Image
 from skimage.metrics import structural_similarity
 
 import firenet_jax as fj
-from firenet_jax import metrics
-from firenet_jax.equalise import equalise
+from firenet_jax.commands.reconstruct import Reconstruct, run
+from firenet_jax.evaluation import metrics
+from firenet_jax.evaluation.equalise import equalise
 from firenet_jax.network import Weights, initial_state
-from firenet_jax.pipeline import Reconstruct, run
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.scenes import SceneSettings, render
-from firenet_jax.sensor import (
+from firenet_jax.simulation.scenes import SceneSettings, render
+from firenet_jax.simulation.sensor import (
     FAULTY,
     SensorSettings,
     first_state,
@@ -49,8 +49,8 @@ from firenet_jax.sensor import (
     simulate,
     window_bounds,
 )
-from firenet_jax.sensor import step as sensor_step
-from firenet_jax.textures import HELD_OUT, load_textures, photographs
+from firenet_jax.simulation.sensor import step as sensor_step
+from firenet_jax.simulation.textures import HELD_OUT, load_textures, photographs
 
 SIZE = {"height": 120, "width": 160}
 SENSORS = {"clean": SensorSettings(), "faulty": replace(FAULTY, threshold_range=(0.1, 0.6))}

@@ -30,7 +30,7 @@ from figures import (
 )
 from harness import save
 
-from firenet_jax.methods import Missing
+from firenet_jax.evaluation.methods import Missing
 from firenet_jax.windows import Windows
 
 EVENTS, SPEED, MOMENTS = 50_000, 3000.0, 4

@@ -33,7 +33,7 @@ from figures import (
 from harness import save
 from matplotlib.figure import Figure
 
-from firenet_jax.methods import Method
+from firenet_jax.evaluation.methods import Method
 from firenet_jax.windows import Window, Windows
 
 MOST = 40  # windows after the start

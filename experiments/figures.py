@@ -20,19 +20,25 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
-from firenet_jax import metrics
-from firenet_jax.comparison import to_8_bit
-from firenet_jax.equalise import equalise
-from firenet_jax.evaluate import CUTS
+from firenet_jax.commands.evaluate import CUTS
+from firenet_jax.evaluation import metrics
+from firenet_jax.evaluation.comparison import to_8_bit
+from firenet_jax.evaluation.equalise import equalise
+from firenet_jax.evaluation.methods import Method, Missing, load
 from firenet_jax.events import Frames, Recording, concatenate
 from firenet_jax.filters import between
-from firenet_jax.methods import Method, Missing, load
 from firenet_jax.pictures import event_pictures
 from firenet_jax.readers import open_recording
-from firenet_jax.scenes import SceneSettings, random_scene, render, rendering_times, video
-from firenet_jax.sensor import FAULTY, SensorSettings, event_list, random_sensor
+from firenet_jax.simulation.scenes import (
+    SceneSettings,
+    random_scene,
+    render,
+    rendering_times,
+    video,
+)
+from firenet_jax.simulation.sensor import FAULTY, SensorSettings, event_list, random_sensor
+from firenet_jax.simulation.textures import HELD_OUT, load_textures, photographs
 from firenet_jax.tensors import pack, voxelise
-from firenet_jax.textures import HELD_OUT, load_textures, photographs
 from firenet_jax.windows import Window, Windows, cut
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -29,13 +29,13 @@ from harness import interleaved, on_this_device, save, table
 from PIL import Image
 from pytorch_firenet import FireNet, normalise, to_picture, voxelise_original
 
-from firenet_jax import pipeline
 from firenet_jax.checkpoint import load_weights
+from firenet_jax.commands import reconstruct as pipeline
+from firenet_jax.commands.reconstruct import Job, Reconstruct, in_chunks
 from firenet_jax.events import Events
-from firenet_jax.pipeline import Job, Reconstruct, in_chunks
 from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import events_to_pictures, initial_session
-from firenet_jax.video import PNG_LEVEL, FolderWriter
+from firenet_jax.storage.video import PNG_LEVEL, FolderWriter
 from firenet_jax.windows import Windows
 
 WIDTH, HEIGHT = 240, 180

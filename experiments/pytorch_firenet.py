@@ -12,9 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from firenet_jax.evaluation.metrics import NLPD_BANDS, NLPD_FARTHER, PYRAMID
 from firenet_jax.events import Events
-from firenet_jax.losses import Loss
-from firenet_jax.metrics import NLPD_BANDS, NLPD_FARTHER, PYRAMID
+from firenet_jax.training.losses import Loss
 
 BINS = 5
 
@@ -143,7 +143,7 @@ def to_picture(image: torch.Tensor) -> torch.Tensor:
     return (255 * (1.3 * image - 0.3 * blurred)).clamp(0, 255).round().to(torch.uint8)
 
 
-# ---- Loss; filters are the same matrices as in `firenet_jax.metrics`, which suits PyTorch too
+# ---- Loss; filters are the same matrices as in `evaluation.metrics`, which suits PyTorch too
 
 
 def _matrix(size: int, weights, border: str = "valid", stride: int = 1) -> np.ndarray:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from firenet_jax.pipeline import Reconstruct, run
+from firenet_jax.commands.reconstruct import Reconstruct, run
 
 OUT = Path(__file__).parents[1] / "docs" / "events_to_video.png"
 HEIGHT = 180

@@ -135,7 +135,7 @@ def real_time(sizes: list[tuple[int, int]], runs: int) -> list[dict]:
 DEVICES = """
 import sys, time
 from pathlib import Path
-from firenet_jax.pipeline import Reconstruct, run
+from firenet_jax.commands.reconstruct import Reconstruct, run
 from firenet_jax.windows import Windows
 folder, output, *where = sys.argv[1:]
 processes, process = map(int, where) if where else [None] * 2

@@ -29,15 +29,15 @@ from harness import RESULTS, save
 from PIL import Image
 
 import firenet_jax as fj
-from firenet_jax import metrics
-from firenet_jax.equalise import equalise
-from firenet_jax.info import describe
+from firenet_jax.commands.info import describe
+from firenet_jax.evaluation import metrics
+from firenet_jax.evaluation.equalise import equalise
 from firenet_jax.network import initial_state
 from firenet_jax.pictures import display, event_pictures, initial_display_state
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.scenes import SceneSettings
-from firenet_jax.sensor import FAULTY, SensorSettings, sequences
-from firenet_jax.textures import HELD_OUT, load_textures, photographs
+from firenet_jax.simulation.scenes import SceneSettings
+from firenet_jax.simulation.sensor import FAULTY, SensorSettings, sequences
+from firenet_jax.simulation.textures import HELD_OUT, load_textures, photographs
 
 DOCS = Path(__file__).parents[1] / "docs"
 HEIGHT, WIDTH, WINDOWS, JUDGED, BATCH, BATCHES = 180, 240, 40, 20, 2, 8

@@ -18,9 +18,15 @@ import jax.numpy as jnp
 import numpy as np
 from harness import interleaved, save, table
 
-from firenet_jax.scenes import SceneSettings, random_scene, rendering_times, video
-from firenet_jax.sensor import FAULTY, SensorSettings, event_list, random_sensor, sequences
-from firenet_jax.textures import load_textures
+from firenet_jax.simulation.scenes import SceneSettings, random_scene, rendering_times, video
+from firenet_jax.simulation.sensor import (
+    FAULTY,
+    SensorSettings,
+    event_list,
+    random_sensor,
+    sequences,
+)
+from firenet_jax.simulation.textures import load_textures
 
 BATCH, WINDOWS, SIZE, RENDERINGS = 4, 20, 128, 5
 CASES = {

@@ -33,11 +33,11 @@ from harness import RESULTS, save
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt  # noqa: E402
 
-from firenet_jax.dataset import Simulate, sequence  # noqa: E402
+from firenet_jax.commands.simulate import Simulate, sequence  # noqa: E402
 from firenet_jax.events import Events, RecordingError, concatenate  # noqa: E402
 from firenet_jax.readers import open_recording  # noqa: E402
-from firenet_jax.sensor import FAULTY, SensorSettings  # noqa: E402
-from firenet_jax.textures import load_textures  # noqa: E402
+from firenet_jax.simulation.sensor import FAULTY, SensorSettings  # noqa: E402
+from firenet_jax.simulation.textures import load_textures  # noqa: E402
 
 MOST = 2_000_000  # events of a recording
 EDGES = np.logspace(0, 7, 71)  # microseconds

@@ -16,8 +16,8 @@ import jax
 from harness import save
 
 from firenet_jax import network
-from firenet_jax.baselines import e2vid
 from firenet_jax.checkpoint import save_weights
+from firenet_jax.evaluation.baselines import e2vid
 
 PAPER = {
     "E2VID": {"parameters": 10_700_000, "memory_mb": 43},

@@ -30,7 +30,7 @@ from harness import RESULTS, interleaved, on_this_device, save, table
 from jax.extend.core import jaxprs_in_params
 
 from firenet_jax import network
-from firenet_jax.baselines import e2vid
+from firenet_jax.evaluation.baselines import e2vid
 from firenet_jax.native import by_xla_alone
 
 matplotlib.use("Agg")

@@ -34,8 +34,8 @@ from figures import (
 from harness import save
 from matplotlib.figure import Figure
 
-from firenet_jax.dataset import Picture, write_sequence
-from firenet_jax.evaluate import Evaluate, run
+from firenet_jax.commands.evaluate import Evaluate, run
+from firenet_jax.commands.simulate import Picture, write_sequence
 
 PAPER = {  # sequence: numbers of HF, MR, E2VID, FireNet
     "mse": {

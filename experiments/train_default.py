@@ -56,10 +56,10 @@ import tyro
 from harness import RESULTS, save
 
 from firenet_jax.checkpoint import load_weights, save_weights
-from firenet_jax.losses import Loss
-from firenet_jax.scenes import SceneSettings
-from firenet_jax.sensor import FAULTY, SensorSettings
-from firenet_jax.train import Train, run
+from firenet_jax.simulation.scenes import SceneSettings
+from firenet_jax.simulation.sensor import FAULTY, SensorSettings
+from firenet_jax.training.losses import Loss
+from firenet_jax.training.run import Train, run
 
 matplotlib.use("agg")
 import matplotlib.pyplot as plt  # noqa: E402

@@ -60,7 +60,6 @@ from pytorch_firenet import (
 )
 
 from firenet_jax.events import Events
-from firenet_jax.losses import Loss
 from firenet_jax.native import by_xla_alone
 from firenet_jax.network import (
     Weights,
@@ -70,11 +69,12 @@ from firenet_jax.network import (
     step,
 )
 from firenet_jax.reconstruction import Network, events_to_pictures, initial_session, reconstruct
-from firenet_jax.scenes import SceneSettings
-from firenet_jax.sensor import SensorSettings
+from firenet_jax.simulation.scenes import SceneSettings
+from firenet_jax.simulation.sensor import SensorSettings
+from firenet_jax.simulation.textures import load_textures
 from firenet_jax.tensors import pack
-from firenet_jax.textures import load_textures
-from firenet_jax.train import TEXTURE, Train, initial_train_state, simulated, train_step
+from firenet_jax.training.losses import Loss
+from firenet_jax.training.run import TEXTURE, Train, initial_train_state, simulated, train_step
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt  # noqa: E402

@@ -36,12 +36,12 @@ _HOME = {
     "normalise": "tensors",
     "open_recording": "readers",
     "pack": "tensors",
-    "recording": "arrays",
+    "recording": "readers.arrays",
     "reconstruct": "reconstruction",
     "save_weights": "checkpoint",
     "step": "network",
     "voxelise": "tensors",
-    "write_video": "video",
+    "write_video": "storage.video",
 }
 
 __all__ = sorted(_HOME)

@@ -11,16 +11,20 @@ import contextlib
 import importlib.resources
 import os
 import zipfile
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import tyro
 
 from firenet_jax.network import BINS, CHANNELS, Weights
-from firenet_jax.pytorch_file import CheckpointError, identify, read_state_dict, refuse_unused, take
+from firenet_jax.storage.pytorch_file import (
+    CheckpointError,
+    identify,
+    read_state_dict,
+    refuse_unused,
+    take,
+)
 
 FORMAT = 1
 MAX_BYTES = 2**20  # six times a whole file: what claims more is no FireNet and is not read
@@ -243,31 +247,3 @@ def convert(path: str | Path) -> Weights:
 
     refuse_unused(tensors, prefix, path, "FireNet", TRY)
     return Weights(params=_unflatten(flat), normalise=names.normalise)
-
-
-@dataclass(frozen=True)
-class Convert:
-    """Turn a published PyTorch checkpoint of FireNet or FireNet+ into a small .npz of weights.
-
-    PyTorch is not needed, and nothing that the checkpoint holds is executed.
-
-    Examples:
-      firenet convert model.pth -o firenet.npz
-    """
-
-    checkpoint: tyro.conf.Positional[Path]
-    """The PyTorch file, as its authors publish it."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Where the weights go, a name that ends in .npz."""
-    overwrite: bool = False
-    """Replace an output that exists."""
-
-
-def run(settings: Convert) -> None:
-    if settings.output.exists() and not settings.overwrite:
-        raise CheckpointError(f"{settings.output} exists; choose another name or pass --overwrite")
-    weights = convert(settings.checkpoint)
-    save_weights(settings.output, weights)
-    count = sum(value.size for value in _flatten(weights.params).values())
-    tensors = "normalised" if weights.normalise else "raw"
-    print(f"{settings.output}: {count:,} parameters, for {tensors} event tensors")

@@ -14,13 +14,29 @@ import sys
 
 # name: (module, settings, what it does)
 COMMANDS = {
-    "demo": ("firenet_jax.demo", "Demo", "a simulated scene -> events | reconstruction | truth"),
-    "reconstruct": ("firenet_jax.pipeline", "Reconstruct", "recordings -> video or pictures"),
-    "info": ("firenet_jax.info", "Info", "what a recording holds"),
-    "simulate": ("firenet_jax.dataset", "Simulate", "training data, or a video file -> events"),
-    "train": ("firenet_jax.train", "Train", "simulated sequences -> weights"),
-    "evaluate": ("firenet_jax.evaluate", "Evaluate", "methods beside camera frames -> report"),
-    "convert": ("firenet_jax.checkpoint", "Convert", "PyTorch checkpoint -> weights.npz"),
+    "demo": (
+        "firenet_jax.commands.demo",
+        "Demo",
+        "a simulated scene -> events | reconstruction | truth",
+    ),
+    "reconstruct": (
+        "firenet_jax.commands.reconstruct",
+        "Reconstruct",
+        "recordings -> video or pictures",
+    ),
+    "info": ("firenet_jax.commands.info", "Info", "what a recording holds"),
+    "simulate": (
+        "firenet_jax.commands.simulate",
+        "Simulate",
+        "training data, or a video file -> events",
+    ),
+    "train": ("firenet_jax.training.run", "Train", "simulated sequences -> weights"),
+    "evaluate": (
+        "firenet_jax.commands.evaluate",
+        "Evaluate",
+        "methods beside camera frames -> report",
+    ),
+    "convert": ("firenet_jax.commands.convert", "Convert", "PyTorch checkpoint -> weights.npz"),
 }
 
 

@@ -42,7 +42,7 @@ def inputs(folder: Path) -> dict[str, Path]:
 
     from firenet_jax.checkpoint import save_weights
     from firenet_jax.network import Weights
-    from firenet_jax.video import write_video
+    from firenet_jax.storage.video import write_video
 
     rng = np.random.default_rng(0)
     count, found = 300, {}
@@ -154,11 +154,14 @@ def mutated(rng: np.random.Generator, data: bytes) -> bytes:
 
 def read(name: str, path: Path) -> None:
     """As the program reads it."""
-    from firenet_jax import batches, dataset, textures, train
     from firenet_jax.checkpoint import load_weights
-    from firenet_jax.files import read_arrays
+    from firenet_jax.commands import simulate as dataset
     from firenet_jax.filters import read_hot_pixels
     from firenet_jax.readers import open_recording
+    from firenet_jax.simulation import textures
+    from firenet_jax.storage.files import read_arrays
+    from firenet_jax.training import batches
+    from firenet_jax.training import run as train
 
     if name == "hot.txt":
         read_hot_pixels(path, 20, 24)

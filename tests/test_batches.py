@@ -8,11 +8,19 @@ import numpy as np
 import pytest
 import references
 
-from firenet_jax import dataset
-from firenet_jax.batches import NOTHING, Augment, _pauses, _simulation, batches, find, split
-from firenet_jax.dataset import Picture, Simulate, write_sequence
+from firenet_jax.commands import simulate as dataset
+from firenet_jax.commands.simulate import Picture, Simulate, write_sequence
 from firenet_jax.events import Events, RecordingError
-from firenet_jax.textures import load_textures
+from firenet_jax.simulation.textures import load_textures
+from firenet_jax.training.batches import (
+    NOTHING,
+    Augment,
+    _pauses,
+    _simulation,
+    batches,
+    find,
+    split,
+)
 from firenet_jax.warp import warp
 
 HEIGHT, WIDTH, IMAGES, CROP, WINDOWS, BATCH = 20, 24, 13, 16, 4, 3

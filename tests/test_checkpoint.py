@@ -10,12 +10,11 @@ from firenet_jax import checkpoint
 from firenet_jax.checkpoint import (
     SHAPES,
     CheckpointError,
-    Convert,
     convert,
     load_weights,
-    run,
     save_weights,
 )
+from firenet_jax.commands.convert import Convert, run
 from firenet_jax.network import Weights, initial_params, initial_state, step
 
 # name in PyTorch -> shape there, as the two published families list them

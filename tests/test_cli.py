@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from test_pipeline import write_recording
 
-from firenet_jax import cli, info
+from firenet_jax import cli
 from firenet_jax.checkpoint import save_weights
+from firenet_jax.commands import info
 from firenet_jax.network import Weights, initial_params
 
 
@@ -220,7 +221,8 @@ def test_no_room_while_writing(here, output):
     write_recording(here / "wide.txt", 40_000, width=200, height=150)
 
     script = (
-        "import resource, sys; from firenet_jax import cli, pipeline; "
+        "import resource, sys; from firenet_jax import cli; from firenet_jax.commands import "
+        "reconstruct; "
         "resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000)); "
         f"sys.exit(cli.main('reconstruct wide.txt -o {output} -c weights.npz --preview'.split()))"
     )

@@ -13,7 +13,7 @@ from firenet_jax.events import concatenate
 from firenet_jax.network import Weights, initial_state
 from firenet_jax.pictures import Display, display, initial_display_state
 from firenet_jax.reconstruction import Network, events_to_pictures, initial_session, reconstruct
-from firenet_jax.sensor import event_list, random_sensor
+from firenet_jax.simulation.sensor import event_list, random_sensor
 from firenet_jax.tensors import normalise, pack, voxelise
 
 HEIGHT, WIDTH = 16, 20

@@ -9,15 +9,23 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from firenet_jax import cli, dataset
-from firenet_jax.dataset import Picture, Simulate, read_clip, rounded_flow, run, write_sequence
+from firenet_jax import cli
+from firenet_jax.commands import simulate as dataset
+from firenet_jax.commands.simulate import (
+    Picture,
+    Simulate,
+    read_clip,
+    rounded_flow,
+    run,
+    write_sequence,
+)
 from firenet_jax.events import Events, concatenate
-from firenet_jax.files import OutputError, locked
 from firenet_jax.readers import open_recording
-from firenet_jax.scenes import SceneSettings
-from firenet_jax.sensor import EPS
-from firenet_jax.textures import load_textures
-from firenet_jax.video import write_video
+from firenet_jax.simulation.scenes import SceneSettings
+from firenet_jax.simulation.sensor import EPS
+from firenet_jax.simulation.textures import load_textures
+from firenet_jax.storage.files import OutputError, locked
+from firenet_jax.storage.video import write_video
 from firenet_jax.warp import warp
 
 HEIGHT, WIDTH = 24, 32

@@ -5,9 +5,10 @@ import jax
 import numpy as np
 import pytest
 
-from firenet_jax import cli, demo
+from firenet_jax import cli
 from firenet_jax.checkpoint import save_weights
-from firenet_jax.demo import Demo, run
+from firenet_jax.commands import demo
+from firenet_jax.commands.demo import Demo, run
 from firenet_jax.network import Weights, initial_params
 
 

@@ -7,8 +7,8 @@ import pytest
 from flax.traverse_util import flatten_dict
 from jax.extend.core import jaxprs_in_params
 
-from firenet_jax.baselines import e2vid
-from firenet_jax.baselines.e2vid import (
+from firenet_jax.evaluation.baselines import e2vid
+from firenet_jax.evaluation.baselines.e2vid import (
     Settings,
     initial_params,
     initial_state,
@@ -17,8 +17,8 @@ from firenet_jax.baselines.e2vid import (
     step,
 )
 from firenet_jax.native import by_xla_alone
-from firenet_jax.pytorch_file import CheckpointError
 from firenet_jax.reconstruction import padding
+from firenet_jax.storage.pytorch_file import CheckpointError
 
 SMALL = 4  # channels: the same network, 64 times as quick
 DECODERS = pytest.mark.parametrize("transposed", [True, False], ids=["transposed", "upsampled"])

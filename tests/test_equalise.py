@@ -6,7 +6,7 @@ from skimage import exposure
 from skimage.filters import rank
 from skimage.morphology import disk
 
-from firenet_jax.equalise import equalise
+from firenet_jax.evaluation.equalise import equalise
 
 ALL = ["none", "global", "local", "clahe"]
 SIZES = [(180, 240), (64, 96), (64, 90), (61, 96), (45, 59), (17, 10)]

@@ -10,19 +10,21 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
-from firenet_jax import cli, comparison, evaluate, methods, metrics
-from firenet_jax.baselines import e2vid
+from firenet_jax import cli
 from firenet_jax.checkpoint import save_weights
-from firenet_jax.comparison import COMPARED, Gap, matched
-from firenet_jax.dataset import Picture, write_sequence
-from firenet_jax.evaluate import Evaluate, interval, plan, read_flow, run
+from firenet_jax.commands import evaluate
+from firenet_jax.commands.evaluate import Evaluate, interval, plan, read_flow, run
+from firenet_jax.commands.simulate import Picture, write_sequence
+from firenet_jax.evaluation import comparison, methods, metrics
+from firenet_jax.evaluation.baselines import e2vid
+from firenet_jax.evaluation.comparison import COMPARED, Gap, matched
+from firenet_jax.evaluation.methods import Missing, load, recurrent_unet
+from firenet_jax.evaluation.report import METRICS, _best, notes, steps
 from firenet_jax.events import Events
-from firenet_jax.files import OutputError
-from firenet_jax.methods import Missing, load, recurrent_unet
 from firenet_jax.network import Weights, initial_params
-from firenet_jax.pytorch_file import CheckpointError
 from firenet_jax.readers import open_recording
-from firenet_jax.report import METRICS, _best, notes, steps
+from firenet_jax.storage.files import OutputError
+from firenet_jax.storage.pytorch_file import CheckpointError
 from firenet_jax.tensors import normalise, pack, voxelise
 from firenet_jax.windows import Window
 

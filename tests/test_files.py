@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firenet_jax.files import OutputError, identity, read_arrays, write_arrays, write_text
+from firenet_jax.storage.files import OutputError, identity, read_arrays, write_arrays, write_text
 
 
 def test_what_was_written_is_read(tmp_path):

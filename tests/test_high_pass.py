@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from firenet_jax.baselines.high_pass import HighPass, advance, initial_state, pack, step
+from firenet_jax.evaluation.baselines.high_pass import HighPass, advance, initial_state, pack, step
 from firenet_jax.events import Events
 from firenet_jax.pictures import bilateral
 from firenet_jax.windows import Window

@@ -8,8 +8,8 @@ import pytest
 import references_metrics as references
 from scipy.ndimage import gaussian_filter
 
-from firenet_jax import losses
-from firenet_jax.losses import Loss, sequence_loss
+from firenet_jax.training import losses
+from firenet_jax.training.losses import Loss, sequence_loss
 
 B, H, W = 2, 32, 35
 NOTHING = Loss(l1=0, nlpd=0, haarpsi=0, lambda_tc=0)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from firenet_jax import lpips as module
-from firenet_jax.lpips import Lpips, load, lpips
-from firenet_jax.pytorch_file import CheckpointError
+from firenet_jax.evaluation import lpips as module
+from firenet_jax.evaluation.lpips import Lpips, load, lpips
+from firenet_jax.storage.pytorch_file import CheckpointError
 
 H, W = 70, 93  # SqueezeNet's first pool reaches outside in its columns, its second in its rows
 

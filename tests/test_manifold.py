@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from firenet_jax.baselines import manifold
-from firenet_jax.baselines.manifold import Manifold, advance, initial_state, pack, step
+from firenet_jax.evaluation.baselines import manifold
+from firenet_jax.evaluation.baselines.manifold import Manifold, advance, initial_state, pack, step
 from firenet_jax.events import Events
 from firenet_jax.windows import Window
 

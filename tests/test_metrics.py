@@ -8,7 +8,7 @@ import references_metrics as references
 from scipy.ndimage import gaussian_filter
 from skimage.metrics import mean_squared_error, peak_signal_noise_ratio
 
-from firenet_jax import metrics
+from firenet_jax.evaluation import metrics
 
 H, W = 44, 57  # an odd side, three scales of MS-SSIM
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from test_pipeline import write_recording
 
-from firenet_jax.video import write_video
+from firenet_jax.storage.video import write_video
 
 SCRIPT = """
 import resource, sys

@@ -12,9 +12,9 @@ import references
 from PIL import Image
 
 from firenet_jax.checkpoint import convert
+from firenet_jax.commands.reconstruct import Reconstruct, run
 from firenet_jax.events import Events
 from firenet_jax.pictures import Display
-from firenet_jax.pipeline import Reconstruct, run
 from firenet_jax.reconstruction import Network
 from firenet_jax.windows import Windows
 

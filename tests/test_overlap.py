@@ -3,7 +3,7 @@ import time
 
 import pytest
 
-from firenet_jax.overlap import ahead
+from firenet_jax.storage.overlap import ahead
 
 
 def test_gives_the_same_items_in_order():

@@ -14,16 +14,16 @@ import pytest
 from PIL import Image
 from processes import finish, start
 
-from firenet_jax import pipeline
 from firenet_jax.checkpoint import load_weights, save_weights
+from firenet_jax.commands import reconstruct as pipeline
+from firenet_jax.commands.reconstruct import Reconstruct, describe, plan, run
 from firenet_jax.events import RecordingError
-from firenet_jax.files import OutputError, locked, read_arrays
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pictures import Display
-from firenet_jax.pipeline import Reconstruct, describe, plan, run
 from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import Network
-from firenet_jax.video import FolderWriter
+from firenet_jax.storage.files import OutputError, locked, read_arrays
+from firenet_jax.storage.video import FolderWriter
 from firenet_jax.windows import Windows
 
 HEIGHT, WIDTH = 20, 24
@@ -90,7 +90,7 @@ def test_a_batch_gives_what_each_recording_gives_alone(tmp_path, weights, batch)
 SHARED = """
 import sys
 from pathlib import Path
-from firenet_jax.pipeline import Reconstruct, run
+from firenet_jax.commands.reconstruct import Reconstruct, run
 from firenet_jax.windows import Windows
 
 weights, folder, output, *where = sys.argv[1:]
@@ -207,7 +207,8 @@ def test_killed_and_run_again_gives_the_same(tmp_path, weights):
     recording = write_recording(tmp_path / "a.txt", 20_000)
     script = textwrap.dedent(f"""
         import os, signal, sys
-        from firenet_jax import cli, pipeline
+        from firenet_jax import cli
+        from firenet_jax.commands import reconstruct as pipeline
         pipeline.RESUME_EVERY = 0
         if sys.argv[1] == "kill":
             write = pipeline.FolderWriter.write

@@ -2,8 +2,8 @@
 
 import re
 
-from firenet_jax import progress
-from firenet_jax.progress import Bytes, bar
+from firenet_jax.storage import progress
+from firenet_jax.storage.progress import Bytes, bar
 
 
 def test_a_line_a_minute_without_a_terminal(capsys, monkeypatch):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firenet_jax.pytorch_file import CheckpointError, read_state_dict
+from firenet_jax.storage.pytorch_file import CheckpointError, read_state_dict
 
 # ---- a writer of both layouts that needs no PyTorch: pickles put together by instruction
 

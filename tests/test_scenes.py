@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, minimum_filter
 
-from firenet_jax import scenes as module
-from firenet_jax.scenes import (
+from firenet_jax.simulation import scenes as module
+from firenet_jax.simulation.scenes import (
     SceneSettings,
     flow,
     random_scene,

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from firenet_jax import sensor as module
 from firenet_jax.events import Events, concatenate
 from firenet_jax.network import initial_state
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.scenes import SceneSettings, rendering_times, video
-from firenet_jax.sensor import (
+from firenet_jax.simulation import sensor as module
+from firenet_jax.simulation.scenes import SceneSettings, rendering_times, video
+from firenet_jax.simulation.sensor import (
     EPS,
     FAULTY,
     LONGEST,
@@ -26,8 +26,8 @@ from firenet_jax.sensor import (
     simulate,
     with_faults,
 )
+from firenet_jax.simulation.textures import load_textures
 from firenet_jax.tensors import pack, voxelise
-from firenet_jax.textures import load_textures
 
 H, W = 12, 14
 

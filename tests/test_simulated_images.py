@@ -9,10 +9,10 @@ from firenet_jax.checkpoint import convert
 from firenet_jax.events import concatenate
 from firenet_jax.network import initial_state
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.scenes import video
-from firenet_jax.sensor import event_list, random_setups, window_bounds
+from firenet_jax.simulation.scenes import video
+from firenet_jax.simulation.sensor import event_list, random_setups, window_bounds
+from firenet_jax.simulation.textures import load_textures
 from firenet_jax.tensors import pack, voxelise
-from firenet_jax.textures import load_textures
 
 T, SIZE, RENDERINGS = 12, 96, 5
 

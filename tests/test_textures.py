@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from firenet_jax import textures as module
-from firenet_jax.textures import HELD_OUT, PROCEDURAL, load_textures, photographs
+from firenet_jax.simulation import textures as module
+from firenet_jax.simulation.textures import HELD_OUT, PROCEDURAL, load_textures, photographs
 
 
 def test_wheel_photographs_are_there():

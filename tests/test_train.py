@@ -13,17 +13,17 @@ import optax
 import pytest
 from processes import finish, start, together
 
-from firenet_jax import train
 from firenet_jax.checkpoint import load_weights, save_weights
-from firenet_jax.dataset import Picture, write_sequence
+from firenet_jax.commands.simulate import Picture, write_sequence
 from firenet_jax.events import Events
-from firenet_jax.files import locked
-from firenet_jax.losses import Loss
 from firenet_jax.network import Weights, initial_params
-from firenet_jax.scenes import SceneSettings
-from firenet_jax.sensor import FAULTY, simulate, window_bounds
-from firenet_jax.textures import load_textures
-from firenet_jax.train import Log, Train, images_of, initial_train_state, run, train_step
+from firenet_jax.simulation.scenes import SceneSettings
+from firenet_jax.simulation.sensor import FAULTY, simulate, window_bounds
+from firenet_jax.simulation.textures import load_textures
+from firenet_jax.storage.files import locked
+from firenet_jax.training import run as train
+from firenet_jax.training.losses import Loss
+from firenet_jax.training.run import Log, Train, images_of, initial_train_state, run, train_step
 
 
 def tiny(folder, **kwargs):
@@ -75,12 +75,12 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(tmp_path, monkeypatch, 
 TOGETHER = """
 import sys
 from pathlib import Path
-from firenet_jax.dataset import Picture, write_sequence
+from firenet_jax.commands.simulate import Picture, write_sequence
 from firenet_jax.events import Events
-from firenet_jax.losses import Loss
-from firenet_jax.scenes import SceneSettings
-from firenet_jax.textures import load_textures
-from firenet_jax.train import Train, run
+from firenet_jax.training.losses import Loss
+from firenet_jax.simulation.scenes import SceneSettings
+from firenet_jax.simulation.textures import load_textures
+from firenet_jax.training.run import Train, run
 
 folder, chain, *where = sys.argv[1:]
 coordinator, processes, process = (where[0], int(where[1]), int(where[2])) if where else [None] * 3

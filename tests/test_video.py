@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from firenet_jax.files import OutputError
-from firenet_jax.video import FolderWriter, VideoWriter, check_output, open_writer, write_video
+from firenet_jax.storage.files import OutputError
+from firenet_jax.storage.video import (
+    FolderWriter,
+    VideoWriter,
+    check_output,
+    open_writer,
+    write_video,
+)
 
 
 def ramp(count=6, height=30, width=41):

@@ -35,17 +35,7 @@ import numpy as np
 import tyro
 
 from firenet_jax.events import Events, concatenate, parse_size
-from firenet_jax.files import (
-    OutputError,
-    alone_in,
-    differences,
-    partial_name,
-    write_text,
-    writing,
-)
-from firenet_jax.overlap import ahead
-from firenet_jax.progress import bar
-from firenet_jax.scenes import (
+from firenet_jax.simulation.scenes import (
     Scene,
     SceneSettings,
     check_seed,
@@ -54,8 +44,24 @@ from firenet_jax.scenes import (
     rendering_times,
     video,
 )
-from firenet_jax.sensor import LONGEST, SensorSettings, event_list, random_sensor, with_faults
-from firenet_jax.textures import load_textures
+from firenet_jax.simulation.sensor import (
+    LONGEST,
+    SensorSettings,
+    event_list,
+    random_sensor,
+    with_faults,
+)
+from firenet_jax.simulation.textures import load_textures
+from firenet_jax.storage.files import (
+    OutputError,
+    alone_in,
+    differences,
+    partial_name,
+    write_text,
+    writing,
+)
+from firenet_jax.storage.overlap import ahead
+from firenet_jax.storage.progress import bar
 
 ROWS = 1 << 16  # events in a chunk of the file, and so many are written at once
 GZIP = 4  # for 50 % more time than level 1: events take 10 % less room, flow 25 %

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from firenet_jax.pytorch_file import identify, read_state_dict, take
+from firenet_jax.storage.pytorch_file import identify, read_state_dict, take
 
 SMALLEST = 31  # pixels of a side: AlexNet's last pool then makes one of them
 # of the three colours in -1 to 1: ImageNet's means and deviations, rounded

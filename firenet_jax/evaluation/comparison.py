@@ -11,10 +11,10 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from firenet_jax import lpips, metrics
-from firenet_jax.equalise import Kind, equalise
+from firenet_jax.evaluation import lpips, metrics
+from firenet_jax.evaluation.equalise import Kind, equalise
+from firenet_jax.evaluation.report import METRICS
 from firenet_jax.events import Recording
-from firenet_jax.report import METRICS
 
 BATCH = 8  # images that are compared at once
 STILLS = (0.2, 0.55, 0.9)  # places of the pictures that are kept, in the part that counts

@@ -30,8 +30,8 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-from firenet_jax import lpips, report
-from firenet_jax.comparison import (
+from firenet_jax.evaluation import lpips, report
+from firenet_jax.evaluation.comparison import (
     BATCH,
     Comparison,
     Gap,
@@ -41,9 +41,15 @@ from firenet_jax.comparison import (
     matched,
     to_8_bit,
 )
-from firenet_jax.equalise import Kind, equalise
+from firenet_jax.evaluation.equalise import Kind, equalise
+from firenet_jax.evaluation.methods import NAMES, Method, Missing, digest, load
+from firenet_jax.evaluation.report import METRICS
 from firenet_jax.events import Frames, Recording, RecordingError, logger, parse_size
-from firenet_jax.files import (
+from firenet_jax.filters import check_span
+from firenet_jax.readers import FORMATS, open_recording
+from firenet_jax.readers.hdf5 import opened
+from firenet_jax.simulation.scenes import check_seed
+from firenet_jax.storage.files import (
     OutputError,
     alone_in,
     differences,
@@ -53,15 +59,9 @@ from firenet_jax.files import (
     write_arrays,
     write_text,
 )
-from firenet_jax.filters import check_span
-from firenet_jax.methods import NAMES, Method, Missing, digest, load
-from firenet_jax.overlap import ahead
-from firenet_jax.progress import bar
-from firenet_jax.readers import FORMATS, open_recording
-from firenet_jax.readers.hdf5 import opened
-from firenet_jax.report import METRICS
-from firenet_jax.scenes import check_seed
-from firenet_jax.video import write_video
+from firenet_jax.storage.overlap import ahead
+from firenet_jax.storage.progress import bar
+from firenet_jax.storage.video import write_video
 from firenet_jax.windows import Window, Windows, cut
 
 # Seconds from the beginning of the Event Camera Dataset's sequences (EVREAL's; one of E2VID's

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from firenet_jax.baselines.packing import clock, columns, seconds_between
+from firenet_jax.evaluation.baselines.packing import clock, columns, seconds_between
 from firenet_jax.pictures import bilateral
 from firenet_jax.windows import Window
 

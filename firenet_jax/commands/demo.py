@@ -18,17 +18,17 @@ import tyro
 from PIL import Image, ImageDraw, ImageFont
 
 from firenet_jax.checkpoint import load_weights
+from firenet_jax.evaluation.metrics import mse, ssim, temporal_error
 from firenet_jax.events import parse_size
-from firenet_jax.metrics import mse, ssim, temporal_error
 from firenet_jax.network import Weights, initial_state
-from firenet_jax.overlap import ahead
 from firenet_jax.pictures import Display, display, event_pictures, initial_display_state
-from firenet_jax.progress import bar
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.scenes import Scene, SceneSettings, check_seed, random_scene
-from firenet_jax.sensor import FAULTY, Sensor, SensorSettings, random_sensor, simulate
-from firenet_jax.textures import HELD_OUT, load_textures, photographs
-from firenet_jax.video import check_output, followed, open_writer
+from firenet_jax.simulation.scenes import Scene, SceneSettings, check_seed, random_scene
+from firenet_jax.simulation.sensor import FAULTY, Sensor, SensorSettings, random_sensor, simulate
+from firenet_jax.simulation.textures import HELD_OUT, load_textures, photographs
+from firenet_jax.storage.overlap import ahead
+from firenet_jax.storage.progress import bar
+from firenet_jax.storage.video import check_output, followed, open_writer
 
 WINDOWS = 10  # simulated and reconstructed at once
 RENDERINGS = 5  # in a window, with at most half a pixel of motion between two

@@ -36,7 +36,11 @@ from firenet_jax.events import (
     parse_size,
     until_damage,
 )
-from firenet_jax.files import (
+from firenet_jax.network import Weights
+from firenet_jax.pictures import Display
+from firenet_jax.readers import open_recording
+from firenet_jax.reconstruction import Network, Session, events_to_pictures, initial_session
+from firenet_jax.storage.files import (
     OutputError,
     identity,
     named,
@@ -45,14 +49,9 @@ from firenet_jax.files import (
     write_text,
     writing,
 )
-from firenet_jax.network import Weights
-from firenet_jax.overlap import ahead
-from firenet_jax.pictures import Display
-from firenet_jax.progress import Bytes, bar
-from firenet_jax.readers import open_recording
-from firenet_jax.reconstruction import Network, Session, events_to_pictures, initial_session
-from firenet_jax.tensors import IN_LISTS, Packed, pack_for_devices
-from firenet_jax.video import (
+from firenet_jax.storage.overlap import ahead
+from firenet_jax.storage.progress import Bytes, bar
+from firenet_jax.storage.video import (
     OTHER_FILES,
     VIDEOS,
     FolderWriter,
@@ -63,6 +62,7 @@ from firenet_jax.video import (
     followed,
     open_writer,
 )
+from firenet_jax.tensors import IN_LISTS, Packed, pack_for_devices
 from firenet_jax.windows import LONGEST, Window, Windows, cut, in_words, usual
 
 # Settings that the pictures do not depend on (on the chunk only in float32's last bits), or that

@@ -19,12 +19,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from firenet_jax.baselines import e2vid, high_pass, manifold
 from firenet_jax.checkpoint import load_weights
+from firenet_jax.evaluation.baselines import e2vid, high_pass, manifold
 from firenet_jax.events import logger
-from firenet_jax.files import named
 from firenet_jax.network import Weights, initial_state
 from firenet_jax.reconstruction import reconstruct
+from firenet_jax.storage.files import named
 from firenet_jax.tensors import normalise, pack, voxelise
 from firenet_jax.windows import Window
 

@@ -30,7 +30,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.events import Events, concatenate
-from firenet_jax.scenes import Scene, SceneSettings, check_range, flow, random_scene, render
+from firenet_jax.simulation.scenes import (
+    Scene,
+    SceneSettings,
+    check_range,
+    flow,
+    random_scene,
+    render,
+)
 from firenet_jax.tensors import BINS
 
 EPS = 0.001

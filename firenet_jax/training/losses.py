@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from firenet_jax import metrics
+from firenet_jax.evaluation import metrics
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ import numpy as np
 from firenet_jax.events import Events, RecordingError, checked, event_number, logger
 from firenet_jax.readers import CHUNK, frame_times, to_events, to_frame
 from firenet_jax.readers.hdf5 import opened
-from firenet_jax.sensor import Simulation
+from firenet_jax.simulation.sensor import Simulation
 from firenet_jax.tensors import BINS, Packed, pack, voxelise
 from firenet_jax.warp import warp
 

@@ -12,8 +12,8 @@ import tyro
 
 from firenet_jax.events import RecordingError, counted, parse_size, until_damage
 from firenet_jax.filters import hot_pixels_of
-from firenet_jax.progress import Bytes, bar
 from firenet_jax.readers import open_recording
+from firenet_jax.storage.progress import Bytes, bar
 from firenet_jax.windows import cut, usual
 
 

@@ -46,8 +46,6 @@ from jax.experimental import multihost_utils
 from PIL import Image
 from tensorboardX import SummaryWriter
 
-from firenet_jax import metrics
-from firenet_jax.batches import NOTHING, Augment, batches, split
 from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.convolution import CONVOLVED
 from firenet_jax.devices import (
@@ -60,9 +58,8 @@ from firenet_jax.devices import (
     on_each_device,
     shared,
 )
+from firenet_jax.evaluation import metrics
 from firenet_jax.events import logger
-from firenet_jax.files import differences, locked, write_text
-from firenet_jax.losses import DISTANCES, Loss, sequence_loss
 from firenet_jax.network import (
     State,
     Weights,
@@ -71,9 +68,8 @@ from firenet_jax.network import (
     step,
 )
 from firenet_jax.pictures import event_pictures
-from firenet_jax.progress import bar
-from firenet_jax.scenes import SceneSettings, check_range, check_seed
-from firenet_jax.sensor import (
+from firenet_jax.simulation.scenes import SceneSettings, check_range, check_seed
+from firenet_jax.simulation.sensor import (
     FAULTY,
     SensorSettings,
     SensorState,
@@ -84,8 +80,12 @@ from firenet_jax.sensor import (
     simulate,
     window_bounds,
 )
+from firenet_jax.simulation.textures import load_textures
+from firenet_jax.storage.files import differences, locked, write_text
+from firenet_jax.storage.progress import bar
 from firenet_jax.tensors import normalise
-from firenet_jax.textures import load_textures
+from firenet_jax.training.batches import NOTHING, Augment, batches, split
+from firenet_jax.training.losses import DISTANCES, Loss, sequence_loss
 
 TEXTURE = 256  # pixels on a side of a texture
 VALIDATION = 8  # batches

@@ -1,0 +1,38 @@
+"""PyTorch checkpoint -> weights.npz."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import tyro
+
+from firenet_jax.checkpoint import CheckpointError, convert, save_weights
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Turn a published PyTorch checkpoint of FireNet or FireNet+ into a small .npz of weights.
+
+    PyTorch is not needed, and nothing that the checkpoint holds is executed.
+
+    Examples:
+      firenet convert model.pth -o firenet.npz
+    """
+
+    checkpoint: tyro.conf.Positional[Path]
+    """The PyTorch file, as its authors publish it."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Where the weights go, a name that ends in .npz."""
+    overwrite: bool = False
+    """Replace an output that exists."""
+
+
+def run(settings: Convert) -> None:
+    if settings.output.exists() and not settings.overwrite:
+        raise CheckpointError(f"{settings.output} exists; choose another name or pass --overwrite")
+    weights = convert(settings.checkpoint)
+    save_weights(settings.output, weights)
+    count = sum(value.size for value in jax.tree.leaves(weights.params))
+    tensors = "normalised" if weights.normalise else "raw"
+    print(f"{settings.output}: {count:,} parameters, for {tensors} event tensors")

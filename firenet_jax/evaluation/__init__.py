@@ -1,0 +1,9 @@
+"""Images beside truth -> numbers: metrics, methods that are compared, and the report of them.
+
+metrics        pure JAX functions of (..., H, W) images: SSIM, NLPD, HaarPSI, ...
+equalise       histogram equalisation, hard and soft
+lpips          LPIPS by weights that the user names
+methods        whatever makes images of events, behind one interface; `baselines` are some
+comparison     images of a method, frames of a camera -> numbers, batch by batch
+report         results -> table, CSV, a page of HTML; only presents
+"""

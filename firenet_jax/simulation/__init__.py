@@ -1,0 +1,8 @@
+"""key -> sequences with truth and optical flow: photographs, motion, sensor.
+
+    textures       photographs, cut at random, and drawn ones
+    scenes         textures and motion -> intensity at any time, with exact flow
+    sensor         intensity -> events, or event tensors that never leave the device
+
+Read `scenes` first, then `sensor.step`: one model of a pixel with all its faults.
+"""
