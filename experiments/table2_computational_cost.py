@@ -162,9 +162,9 @@ def plot(rows: list[dict], path: Path) -> None:
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=7)
-    parser.add_argument("--quick", action="store_true", help="two small sizes, save nothing")
+    parser.add_argument("--quick", action="store_true", help="the smallest size, save nothing")
     options = parser.parse_args()
-    resolutions = list(PAPER["FireNet"])[: 2 if options.quick else None]
+    resolutions = list(PAPER["FireNet"])[: 1 if options.quick else None]
     runs = 2 if options.quick else options.runs
     rows = [row for resolution in resolutions for row in measure(resolution, runs)]
     show(rows)

@@ -1,20 +1,49 @@
-"""What all tests share: strict JAX flags, the slow switch, data outside the repository."""
+"""What all tests share: strict JAX flags, compiled programs, the slow switch, data outside the
+repository, and which tests run in one process (`-n 2 --dist loadgroup`).
+"""
 
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
-import jax
-import pytest
+# Set before JAX is imported, which reads it. XLA compiles for most of the time, so what it has
+# compiled is kept for the session: for the other process of pytest-xdist and for programs that
+# tests start, which inherit the environment. Our machine code is not in there: a program names it,
+# and each process makes its own.
+_PROGRAMS = None
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    _PROGRAMS = os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="firenet_xla_")
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.05"
+    # XLA says of each program that it was compiled for "+prefer-no-gather", which is no feature of
+    # a processor but a hint to LLVM.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# With `-n 2 --dist loadgroup` a file's tests share data and run in one process, but each of these
+# may run in another; pytest-xdist begins with the files of many tests, so they fill what is left.
+APART = ("test_experiments.py", "test_no_room.py")
+
+
+def pytest_unconfigure():
+    if _PROGRAMS:
+        shutil.rmtree(_PROGRAMS, ignore_errors=True)
 
 
 def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="run the slow tests too")
 
 
+@pytest.hookimpl(tryfirst=True)  # pytest-xdist asks for the groups in the same hook
 def pytest_collection_modifyitems(config, items):
     for item in items:
+        if config.pluginmanager.hasplugin("xdist"):
+            group = item.nodeid if item.path.name in APART else item.path.name
+            item.add_marker(pytest.mark.xdist_group(group))
         if "slow" in item.keywords and not config.getoption("--slow"):
             item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
 

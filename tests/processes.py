@@ -1,5 +1,6 @@
-"""Scripts in processes of their own, with virtual devices, alone or together."""
+"""Scripts in processes of their own: with virtual devices, alone or together, with little room."""
 
+import json
 import os
 import socket
 import subprocess
@@ -33,3 +34,41 @@ def together(script, *arguments, processes=2):
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
     finish(*(start(script, *arguments, address, processes, n) for n in range(processes)))
+
+
+# The libraries are imported before the limit is set: they write files of their own.
+LIMITED = """
+import json, resource, sys
+import h5py, jax, orbax.checkpoint
+from firenet_jax import cli
+for limit, line in json.loads(sys.argv[1]):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+    code = cli.main(line.split())
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    print(f"exit code {code}", file=sys.stderr, flush=True)
+"""
+
+
+def with_little_room(folder, *lines):
+    """(limit of a file's size, command line), ... -> [(exit code, lines said), ...].
+
+    One process runs them all, which compiles their programs once. A limit stands for a full disk:
+    it needs no rights, and the libraries in C meet it where they write.
+    """
+    ran = subprocess.run(
+        [sys.executable, "-c", LIMITED, json.dumps(lines)],
+        cwd=folder, capture_output=True, text=True, timeout=600,
+        # The limit holds for the compiled programs that tests share too: these are only read.
+        env=os.environ | {"JAX_PLATFORMS": "cpu"}
+        | {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "1e9"},
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr[-2000:]
+    results, said = [], []
+    for line in ran.stderr.strip().splitlines():
+        if line.startswith("exit code "):
+            results.append((int(line.removeprefix("exit code ")), said))
+            said = []
+        else:
+            said.append(line)
+    assert not said and len(results) == len(lines), ran.stderr[-2000:]
+    return results

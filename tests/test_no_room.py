@@ -1,28 +1,14 @@
-"""A disk that becomes full, in every command that writes: one sentence, and nothing half-written.
+"""A disk that becomes full, in all commands that write: one sentence, and nothing half-written."""
 
-A limit on the size of a file stands for the disk, in a process of its own: it needs no rights, and
-the libraries in C meet it where they write.
-"""
-
-import os
-import subprocess
 import sys
 
 import h5py
 import numpy as np
 import pytest
+from processes import with_little_room
 from test_pipeline import write_recording
 
 from firenet_jax.storage.video import write_video
-
-SCRIPT = """
-import resource, sys
-import h5py, jax, orbax.checkpoint  # before the limit: they write files of their own
-from firenet_jax import cli
-limit, *arguments = sys.argv[1:]
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit), int(limit)))
-sys.exit(cli.main(arguments))
-"""
 
 
 def sequence(path, size=32, images=40):
@@ -46,41 +32,47 @@ def make_inputs(folder):
     write_video(folder / "clip.mp4", pictures)
 
 
-TRAIN = "train -o out --steps 4 --warmup 1 --batch 1 --crop 32 --windows 11 --textures 4"
-TRIALS = [
-    ("demo -o out.mp4 --seconds 0.4 --sensor-size 64x48", 2_000, "out.mp4"),
-    ("demo -o out.gif --seconds 0.4 --sensor-size 64x48", 2_000, "out.gif"),
-    ("demo -o out --seconds 0.4 --sensor-size 64x48", 2_000, "out"),
-    ("reconstruct a.txt -o out -N 2000 --preview", 2_000, "out"),
-    ("reconstruct a.txt -o out.mp4 -N 2000 --preview", 2_000, "out.mp4"),
-    ("simulate -o set --sequences 1 --validation 0 --seconds 0.2 --sensor-size 64x48", 3_000,
-     "set/train/000000.h5"),
-    ("simulate -o set --sequences 1 --validation 0 --seconds 0.2 --sensor-size 64x48", 30_000,
-     "set/train/000000.h5"),
-    ("simulate -o out.h5 --video clip.mp4", 5_000, "out.h5"),
-    (TRAIN, 100, "out/settings.json"),
-    (TRAIN, 40_000, "out/weights.npz"),
-    ("evaluate a.h5 -o out --methods firenet", 3_000, "out/index.html"),
-    ("convert {reference}/firenet_published.pth -o out.npz", 40_000, "out.npz"),
-]  # fmt: skip
+SIMULATE = "--sequences 1 --validation 0 --seconds 0.2 --sensor-size 64x48"
+TRAIN = "--steps 4 --warmup 1 --batch 1 --crop 32 --windows 11 --textures 4"
+TRIALS = {
+    "demo": [
+        ("-o out.mp4 --seconds 0.4 --sensor-size 64x48", 2_000, "out.mp4"),
+        ("-o out.gif --seconds 0.4 --sensor-size 64x48", 2_000, "out.gif"),
+        ("-o out --seconds 0.4 --sensor-size 64x48", 2_000, "out"),
+    ],
+    "reconstruct": [
+        ("a.txt -o out -N 2000 --preview", 2_000, "out"),
+        ("a.txt -o out.mp4 -N 2000 --preview", 2_000, "out.mp4"),
+    ],
+    "simulate": [
+        (SIMULATE + " -o one", 3_000, "one/train/000000.h5"),
+        (SIMULATE + " -o two", 30_000, "two/train/000000.h5"),
+        ("-o out.h5 --video clip.mp4", 5_000, "out.h5"),
+    ],
+    "train": [
+        (TRAIN + " -o one", 100, "one/settings.json"),
+        (TRAIN + " -o two", 40_000, "two/weights.npz"),
+    ],
+    "evaluate": [("a.h5 -o out --methods firenet", 3_000, "out/index.html")],
+    "convert": [("{reference}/firenet_published.pth -o out.npz", 40_000, "out.npz")],
+}
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits of this kind")
 @pytest.mark.slow
-@pytest.mark.parametrize("line, limit, output", TRIALS)
-def test_one_sentence_and_nothing_half_written(tmp_path, request, line, limit, output):
+@pytest.mark.parametrize("command", TRIALS)
+def test_one_sentence_and_nothing_half_written(tmp_path, request, command):
     make_inputs(tmp_path)
-    if "{reference}" in line:
-        line = line.format(reference=request.getfixturevalue("reference"))
-    ran = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(limit), *line.split()],
-        cwd=tmp_path, capture_output=True, text=True, timeout=300,
-        env=os.environ | {"JAX_PLATFORMS": "cpu"},
-    )  # fmt: skip
-    said = ran.stderr.strip().splitlines()
-    assert ran.returncode == 1, (ran.returncode, ran.stderr[-2000:])
-    errors = [line for line in said if line.startswith("firenet: error: ")]
-    assert len(errors) == 1 and said[-1] == errors[0], ran.stderr[-2000:]
-    assert "Traceback" not in ran.stderr and "Exception" not in ran.stderr, ran.stderr[-2000:]
-    assert "File too large" in errors[0], errors
-    assert not (tmp_path / output).exists()
+    reference = request.getfixturevalue("reference") if command == "convert" else None
+    lines = [
+        (limit, f"{command} {line.format(reference=reference)}")
+        for line, limit, _ in TRIALS[command]
+    ]
+    ran = with_little_room(tmp_path, *lines)
+    for (code, said), (line, _, output) in zip(ran, TRIALS[command], strict=True):
+        assert code == 1, (line, said)
+        errors = [each for each in said if each.startswith("firenet: error: ")]
+        assert len(errors) == 1 and said[-1] == errors[0], said
+        assert not any("Traceback" in each or "Exception" in each for each in said), said
+        assert "File too large" in errors[0], errors
+        assert not (tmp_path / output).exists()
