@@ -97,6 +97,18 @@ class Frames(NamedTuple):
     read: Callable[[int], np.ndarray]  # i -> (H, W) uint8
 
 
+class Triggers(NamedTuple):
+    """Edges of the signals at a camera's trigger inputs, in time order."""
+
+    times: np.ndarray  # (N,) int64, microseconds, on the clock of the events
+    ids: np.ndarray  # (N,) int64, number of the input
+    polarity: np.ndarray  # (N,) bool, True: rising, or a file that does not tell the edges apart
+
+
+def no_triggers() -> None:
+    """Of a recording that holds none."""
+
+
 @dataclass(frozen=True)
 class Recording:
     """A file or folder of events, opened but not read: memory does not grow with its length."""
@@ -110,6 +122,7 @@ class Recording:
     frames: Frames | None = None
     inferred: bool = False  # whether the sensor's size is that of its events
     grey: bool = False  # whether the file says that the sensor sees no colours
+    triggers: Callable[[], Triggers | None] = no_triggers  # reads the file; None: there are none
 
     @property
     def pixels(self) -> int:

@@ -75,7 +75,8 @@ CUTS = {
     "shapes_6dof": (5.0, 20.0),
     "slider_depth": (1.0, 2.5),
 }
-SUFFIXES = (".h5", ".hdf5", ".hdf", ".zip", ".bag", ".mcap", ".aedat4")  # which can hold frames
+# which can hold frames
+SUFFIXES = (".h5", ".hdf5", ".hdf", ".zip", ".bag", ".mcap", ".aedat", ".aedat4")
 SMALLEST = 17  # pixels of a side: what CW-SSIM's filters need
 WIDEST = 2000  # pixels of a video
 

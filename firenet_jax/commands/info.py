@@ -19,7 +19,7 @@ from firenet_jax.windows import cut, usual
 
 @dataclass(frozen=True)
 class Info:
-    """Say what a recording holds: format, sensor, events, rate, frames, hot pixels, window size.
+    """Say what a recording holds: format, sensor, events, rate, frames, triggers, hot pixels.
 
     Examples:
       firenet info recording.zip
@@ -27,7 +27,7 @@ class Info:
     """
 
     recording: tyro.conf.Positional[Path]
-    """Text, zip, HDF5, ECD or EVREAL folder, .bin, .dat, .raw, .aedat4, .es, ROS bag."""
+    """Text, zip, HDF5, ECD or EVREAL folder, .bin, .dat, .raw, .aedat, .aedat4, .es, ROS bag."""
     sensor_size: str | None = None
     """WIDTHxHEIGHT of the sensor, where the recording does not say it."""
     columns: str | None = None
@@ -70,6 +70,7 @@ def describe(
         raise RecordingError(
             f"{path}: holds no events: check that it was recorded and copied whole"
         )
+    triggers = recording.triggers()
     hot = np.argwhere(hot_pixels_of(counts.reshape(recording.height, recording.width)))
     seconds = (last - first) / 1e6
     return {
@@ -85,6 +86,8 @@ def describe(
         "events_per_second": total / seconds if seconds else None,
         "on_share": on / total,
         "frames": 0 if recording.frames is None else len(recording.frames.times),
+        "triggers": 0 if triggers is None else len(triggers.times),
+        "trigger_inputs": [] if triggers is None else np.unique(triggers.ids).tolist(),
         "hot_pixels": [[int(x), int(y)] for y, x in hot],
         "events_per_window": windows.count(recording.pixels),
         "longest_window_ms": windows.longest,
@@ -100,7 +103,7 @@ def run(settings: Info) -> None:
         print(json.dumps(facts, indent=2))
         return
     rate = facts["events_per_second"]
-    hot = facts["hot_pixels"]
+    hot, inputs = facts["hot_pixels"], facts["trigger_inputs"]
     shown = " ".join(f"({x},{y})" for x, y in hot[:8]) + (" ..." if len(hot) > 8 else "")
     lines = {
         "format": facts["format"],
@@ -111,6 +114,10 @@ def run(settings: Info) -> None:
         "rate": "all at one time" if rate is None else f"{rate / 1e6:.3f} million events/s",
         "polarity": f"{facts['on_share']:.1%} ON",
         "frames": f"{facts['frames']}" if facts["frames"] else "none",
+        "triggers": f"{facts['triggers']:,} at "
+        + (f"input{'s' * (len(inputs) != 1)} " + ", ".join(map(str, inputs)))
+        if inputs
+        else "none",
         "hot pixels": f"{len(hot)}" + (f", (x,y): {shown}" if hot else ""),
         "window": f"{facts['events_per_window']:,} events (0.35 per pixel), at most "
         f"{facts['longest_window_ms']:g} ms: {counted(facts['windows'], 'image')}",

@@ -86,7 +86,7 @@ class Reconstruct:
         tyro.conf.Positional[tuple[Path, ...]],
         tyro.conf.arg(metavar="RECORDING...", help_behavior_hint=""),
     ]
-    """Text, zip, HDF5, ECD or EVREAL folder, .bin, .dat, .raw, .aedat4, .es, ROS bag."""
+    """Text, zip, HDF5, ECD or EVREAL folder, .bin, .dat, .raw, .aedat, .aedat4, .es, ROS bag."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """A folder (for png files and timestamps.txt), or a name that ends in .mp4 or .gif. With
     several recordings one entry each, named after them, in the folder of that name."""

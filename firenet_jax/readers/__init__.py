@@ -28,15 +28,20 @@ from firenet_jax.events import (
     Recording,
     RecordingError,
     Rows,
+    Triggers,
     checked,
     concatenate,
     event_number,
     logger,
+    no_triggers,
     until_damage,
 )
 
 # In the order in which they are asked.
-FORMATS = ("ecd", "npy", "rosbag", "hdf5", "text", "ncaltech", "dat", "aedat4", "camera")
+FORMATS = (
+    "ecd", "npy", "rosbag", "hdf5", "text", "ncaltech", "dat", "aedat4", "aedat3", "aedat2",
+    "camera",
+)  # fmt: skip
 
 CHUNK = 1 << 18  # events a reader yields at once: 3 MB as Events
 
@@ -51,6 +56,7 @@ class Source:
     count: int | None = None  # number of events where the file says it
     frames: Frames | None = None
     grey: bool = False  # whether the file says that the sensor sees no colours
+    triggers: Callable[[], Triggers | None] = no_triggers  # up to damage, of which events tell
     place: Callable[[int], str] = event_number  # row, from 0 -> its name in the file: "line 7"
 
 
@@ -84,12 +90,16 @@ def open_recording(
         if module.matches(path):
             if columns is not None and name not in ("text", "npy"):
                 raise RecordingError(f"{path}: is of a format that sets the order of its columns")
-            source = module.read(path) if columns is None else module.read(path, columns=columns)
+            options = {} if columns is None else {"columns": columns}
+            if name == "aedat2" and sensor_size is not None:  # its rows are counted from the bottom
+                options["size"] = sensor_size
+            source = module.read(path, **options)
             break
     else:
         raise RecordingError(
             f"{path}: not a recording of a known format: expected text or zip, an ECD or EVREAL "
-            "folder, HDF5, .npy, .npz, N-Caltech101 .bin, .dat, .raw, .aedat4, .es, or a ROS bag"
+            "folder, HDF5, .npy, .npz, N-Caltech101 .bin, .dat, .raw, .aedat, .aedat4, .es, or a "
+            "ROS bag"
         )
     said = 0
 
@@ -115,7 +125,16 @@ def open_recording(
         frames=source.frames,
         inferred=size is None,
         grey=source.grey,
+        triggers=lambda: _in_order(source.triggers()),
     )
+
+
+def _in_order(triggers: Triggers | None) -> Triggers | None:
+    if triggers is None or not len(triggers.times):
+        return None
+    order = np.argsort(triggers.times, kind="stable")
+    times, ids, polarity = (np.asarray(column)[order] for column in triggers)
+    return Triggers(times.astype(np.int64), ids.astype(np.int64), polarity.astype(bool))
 
 
 def _stated(path: Path, source: Source) -> tuple[int, int] | None:
@@ -171,6 +190,21 @@ def joined(chunks: Iterable[Events], least: int = CHUNK // 4) -> Iterator[Events
         yield concatenate(waiting)
     if damage is not None:
         raise damage
+
+
+def all_triggers(pieces: Iterable[tuple], *errors: type[BaseException]) -> Triggers | None:
+    """Pieces of (times, ids, polarity) -> all of them, up to one of these errors."""
+    columns = [[], [], []]
+    try:
+        for piece in pieces:
+            for column, values in zip(columns, piece, strict=True):
+                column.append(np.asarray(values, np.int64))
+    except (RecordingError, *errors):
+        pass  # whoever reads the events will hear of it
+    if not columns[0]:
+        return None
+    times, ids, polarity = map(np.concatenate, columns)
+    return Triggers(times, ids, polarity > 0)
 
 
 def microseconds(seconds: np.ndarray) -> np.ndarray:

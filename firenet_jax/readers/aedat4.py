@@ -23,8 +23,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pyarrow as pa
 
-from firenet_jax.events import Events, Frames, RecordingError, Rows
-from firenet_jax.readers import Source, joined, reading, to_events, to_frame
+from firenet_jax.events import Events, Frames, RecordingError, Rows, Triggers
+from firenet_jax.readers import Source, aedat, all_triggers, joined, reading, to_events, to_frame
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 CODECS = {0: None, 1: "lz4", 2: "lz4", 3: "zstd", 4: "zstd"}
@@ -41,6 +41,8 @@ EVENT = np.dtype(
     }
 )
 CHANNELS = {0: 1, 16: 3, 24: 4}  # OpenCV's numbers for grey, BGR, BGRA of 8 bits
+# kinds: (input, whether the edge rises); a pulse counts as a rising edge, the output as input 1
+EDGES = {1: (0, 1), 2: (0, 0), 3: (0, 1), 4: (1, 1), 5: (1, 0)}
 DAMAGED = struct.error, ValueError, IndexError, OSError  # what damaged bytes raise here
 
 
@@ -54,10 +56,11 @@ class Layout(NamedTuple):
     frames: int | None  # stream; None: no frames
     size: tuple[int, int] | None  # (height, width)
     explorer: bool  # whether the camera is a DVXplorer, of which none sees colours
+    triggers: int | None  # stream; None: no triggers
 
 
 def matches(path: Path) -> bool:
-    return path.is_file() and path.suffix.lower() == ".aedat4"
+    return path.is_file() and (path.suffix.lower() == ".aedat4" or aedat.version(path) == "4.0")
 
 
 def read(path: Path) -> Source:
@@ -69,6 +72,7 @@ def read(path: Path) -> Source:
         layout.size,
         frames=frames,
         grey=layout.explorer or (frames is not None and _is_grey(path, layout)),
+        triggers=lambda: _triggers(path, layout),
     )
 
 
@@ -136,7 +140,10 @@ def _layout(path: Path) -> Layout:
     if not events:
         kinds = ", ".join(sorted({kind for kind, _ in streams.values()})) or "nothing"
         raise RecordingError(f"{path}: holds no events, but {kinds}: record them too")
-    frames = [number for number, (kind, _) in streams.items() if kind == "FRME"]
+    frames, triggers = (
+        [number for number, (kind, _) in streams.items() if kind == wanted]
+        for wanted in ("FRME", "TRIG")
+    )
     return Layout(
         CODECS[codec],
         begin,
@@ -145,6 +152,7 @@ def _layout(path: Path) -> Layout:
         frames[0] if frames else None,
         streams[events[0]][1],
         b">DVXplorer_" in header,
+        triggers[0] if triggers else None,
     )
 
 
@@ -215,6 +223,23 @@ def _events(path: Path, layout: Layout) -> Iterator[Events | Rows]:
             chunk = to_events(path, row, events["t"], events["x"], events["y"], events["on"] != 0)
             yield chunk
             row += len(chunk)
+
+
+def _triggers(path: Path, layout: Layout) -> Triggers | None:
+    def pieces():
+        with open(path, "rb") as file:
+            for place, size in _packets(path, file, layout, layout.triggers):
+                data = _unpacked(file, layout, place, size)
+                start = _field(data, _root(data), 0, "at")
+                start, count = (0, 0) if start is None else _vector(data, start, 4)
+                edges = []
+                for at in range(start, start + 4 * count, 4):
+                    table = _root(data, at)
+                    if (kind := _field(data, table, 1, "b", 0)) in EDGES:
+                        edges.append((_field(data, table, 0, "q", 0), *EDGES[kind]))
+                yield np.array(edges, np.int64).reshape(-1, 3).T
+
+    return None if layout.triggers is None else all_triggers(pieces(), *DAMAGED)
 
 
 # ---- Frames

@@ -4,8 +4,10 @@
               of the sensor is taken from the header only (faery guesses 1280x720 without)
     .es       Event Stream: 5 bytes an event, rows counted from the bottom (turned round here)
 
-Times are microseconds. faery holds back a time that falls below an earlier one to that one. A .raw
-or .es file that was cut off between two words looks whole: neither says how long it is.
+Edges at trigger inputs are read without faery, which passes them over (evt2.py, evt3.py; those of
+EVT2.1 are not read). Times are microseconds. faery holds back a time that falls below an earlier
+one to that one. A .raw or .es file that was cut off between two words looks whole: neither says how
+long it is.
 """
 
 import re
@@ -14,12 +16,27 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
-from firenet_jax.events import Events, RecordingError, Rows
-from firenet_jax.readers import Source, extra, joined, to_events
+import numpy as np
+
+from firenet_jax.events import Events, RecordingError, Rows, Triggers
+from firenet_jax.readers import (
+    CHUNK,
+    Source,
+    all_triggers,
+    evt2,
+    evt3,
+    extra,
+    joined,
+    to_events,
+)
 from firenet_jax.readers.dat import header_size, read_header
 
 FORMATS = {".raw": "Prophesee raw", ".es": "Event Stream"}
 WORD = {"2": 4, "2.0": 4, "2.1": 8, "21": 8, "3": 2, "3.0": 2}  # version: bytes
+DECODERS = {
+    "2": (evt2.triggers, -1, np.dtype("<u4")),
+    "3": (evt3.triggers, evt3.State(), np.dtype("<u2")),
+}  # of triggers: function, state at the beginning, words
 LARGEST = (2048, 2048)  # what EVT's 11 bits reach, so that faery refuses nothing
 
 
@@ -30,18 +47,25 @@ def matches(path: Path) -> bool:
 def read(path: Path) -> Source:
     kind = path.suffix.lower()
     faery = extra("faery", path)
-    name, cut = FORMATS[kind], False
+    name, cut, version, start = FORMATS[kind], False, "", 0
     if kind == ".raw":
-        name, size, cut = _raw_header(path)
+        name, size, cut, version, start = _raw_header(path)
     else:
         with _guarded(path):
             width, height = faery.events_stream_from_file(path).dimensions()
         size = (height, width)
-    return Source(name, lambda: joined(_events(faery, path, cut)), size, grey=kind == ".raw")
+    return Source(
+        name,
+        lambda: joined(_events(faery, path, cut)),
+        size,
+        grey=kind == ".raw",
+        triggers=lambda: _triggers(path, version[:1] if WORD.get(version) != 8 else "", start),
+    )
 
 
-def _raw_header(path: Path) -> tuple[str, tuple[int, int] | None, bool]:
-    """-> "Prophesee raw EVT3", (height, width) where the header says it, whether a word is cut"""
+def _raw_header(path: Path) -> tuple[str, tuple[int, int] | None, bool, str, int]:
+    """-> "Prophesee raw (EVT3)", (height, width) where the header says it, whether a word is cut,
+    the version, where words begin, bytes from the beginning of the file"""
     with open(path, "rb") as file:
         header = read_header(file)
         start = file.tell()
@@ -52,7 +76,26 @@ def _raw_header(path: Path) -> tuple[str, tuple[int, int] | None, bool]:
             "of another format"
         )
     cut = (path.stat().st_size - start) % WORD[version[1]] > 0
-    return f"Prophesee raw (EVT{version[1].removesuffix('.0')})", header_size(header), cut
+    name = f"Prophesee raw (EVT{version[1].removesuffix('.0')})"
+    return name, header_size(header), cut, version[1], start
+
+
+def _triggers(path: Path, version: str, start: int) -> Triggers | None:
+    """version: "2", "3", or of another format, which has none."""
+    if version not in DECODERS:
+        return None
+    decode, state, kind = DECODERS[version]
+
+    def pieces():
+        now = state
+        with open(path, "rb") as file:
+            file.seek(start)
+            while data := file.read(CHUNK * kind.itemsize):
+                words = np.frombuffer(data, kind, len(data) // kind.itemsize)
+                now, edges = decode(now, words)
+                yield edges
+
+    return all_triggers(pieces())
 
 
 @contextmanager

@@ -8,7 +8,8 @@
     0x5  vector of 8    bit i: an event at base + i; then the base moves on by 8
     0x6  time low       bits 11-0 of the time, microseconds
     0x8  time high      bits 23-12 of the time, which starts again from 0 after 16.8 s
-    others              triggers and vendor's data: no events
+    0xA  trigger        input (bits 11-8), edge (bit 0): 1 rises
+    others              vendor's data: no events
 
 A word changes what it names and leaves the rest, so a stream that comes in pieces needs the state
 between them. "The last such word before this one" is an index: the running count of such words.
@@ -73,6 +74,17 @@ def decode(state: State, words: np.ndarray) -> tuple[State, tuple[np.ndarray, ..
     next_base = starts[-1] + (moved[-1] if words.size and starts[-1] >= 0 else 0)
     state = State(*map(int, (times[-1], latest[-1], high, rows[-1], next_base, polarities[-1])))
     return state, (t, first[entry] + bit, y[entries][entry], on[entry])
+
+
+def triggers(state: State, words: np.ndarray) -> tuple[State, tuple[np.ndarray, ...]]:
+    """(N,) uint16 -> state behind them, of which only the time counts, (times, ids, polarity) of
+    the edges at the trigger inputs: int64 microseconds, input, 0 or 1. Edges before the first
+    complete time are left out."""
+    kind, load = words >> 12, (words & 0xFFF).astype(np.int64)
+    time, times, high = _times(state, kind, load)
+    edges = np.flatnonzero((kind == 0xA) & (time >= 0))
+    state = state._replace(time=int(times[-1]), high=high)
+    return state, (time[edges], load[edges] >> 8, load[edges] & 1)
 
 
 def _times(state: State, kind: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:

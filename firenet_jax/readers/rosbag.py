@@ -4,9 +4,12 @@
     prophesee_event_msgs/EventArray the same
     event_camera_msgs/EventPacket   header, height, width, seq, time_base, encoding, is_bigendian,
     (once event_array_msgs/EventArray)   events: bytes, of which these encodings are read:
-        evt3    16-bit words (evt3.py)
+        evt3    16-bit words (evt3.py), edges at trigger inputs among them
+        libcaer, libcaer_cmp    iniVation's cameras (libcaer.py)
         mono    64 bits: nanoseconds after time_base (bits 0-31), x (32-47), y (48-62), polarity
     sensor_msgs/Image               frames: mono8, rgb8, bgr8, mono16
+
+A folder's metadata.yaml may name no storage: then its files are read for what they are.
 
 Times are microseconds of the ROS clock. EventPackets carry the sensor's own clock: the first event
 is put at the time in its message's header, so events and frames agree but for the transport.
@@ -14,6 +17,7 @@ Messages are decoded from their bytes: ROS 1 packs fields, ROS 2 (CDR) aligns ea
 """
 
 import contextlib
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import chain
@@ -23,14 +27,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firenet_jax.events import Events, Frames, RecordingError, logger
-from firenet_jax.readers import Source, evt3, extra, joined, reading, to_events, to_frame
-from firenet_jax.readers.torn_bag import Torn
+from firenet_jax.events import Events, Frames, RecordingError, Triggers, logger
+from firenet_jax.readers import (
+    Source,
+    all_triggers,
+    evt3,
+    extra,
+    joined,
+    libcaer,
+    reading,
+    to_events,
+    to_frame,
+    torn_bag,
+    torn_mcap,
+)
 
 ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
 IMAGE = "sensor_msgs/msg/Image"
-WORDS = 1 << 18  # EVT3 words decoded at once: messages are tiny
+WORDS = 1 << 18  # words of 16 bits decoded at once: messages are tiny
+TORN = {".bag": torn_bag.Torn, ".mcap": torn_mcap.Torn}
 ORDERS = {"<": "little", ">": "big"}
 CHANNELS = {"mono8": 1, "8UC1": 1, "mono16": 1, "16UC1": 1, "rgb8": 3, "bgr8": 3}
 
@@ -56,6 +72,7 @@ def read(path: Path) -> Source:
         lambda: joined(_events(path, topic, topics[topic] in ARRAYS)),
         size,
         frames=frames,
+        triggers=lambda: None if topics[topic] in ARRAYS else _triggers(path, topic),
     )
 
 
@@ -65,17 +82,53 @@ def _is_ros1(path: Path) -> bool:
 
 @contextmanager
 def _bag(path: Path):
-    """The bag; a ROS 1 bag that cannot be opened is read without its index, as far as it goes."""
+    """The bag; one that cannot be opened is read without its index, as far as it goes."""
+    with contextlib.ExitStack() as opened:
+        yield _opened(path, opened)
+
+
+def _opened(path: Path, opened: contextlib.ExitStack):
+    """What is open until `opened` is closed."""
     library = extra("rosbags.rosbag1" if _is_ros1(path) else "rosbags.rosbag2", path)
-    opened = contextlib.ExitStack()
     try:
-        bag = opened.enter_context(library.Reader(path))
+        return opened.enter_context(library.Reader(path))
     except Exception:  # damaged bytes reach every kind
-        bag = Torn(path) if _is_ros1(path) else None
+        bag = None
+        if path.is_dir():
+            if files := _files(path):
+                bag = _Files([_opened(file, opened) for file in files])
+        elif path.suffix.lower() in TORN:
+            bag = TORN[path.suffix.lower()](path)
         if bag is None or not bag.connections:
             raise
-    with opened:
-        yield bag
+        return bag
+
+
+def _files(path: Path) -> list[Path]:
+    """The files that a folder's metadata.yaml names, in its order, or all; none where one lacks."""
+    text = (path / "metadata.yaml").read_bytes().decode("utf-8", "replace")
+    names = dict.fromkeys(re.findall(r"[^\s/'\"]+\.(?:mcap|db3)\b", text))
+    files = [path / name for name in names] or sorted(
+        file for file in path.iterdir() if file.suffix in (".mcap", ".db3")
+    )
+    return files if all(file.is_file() for file in files) else []
+
+
+class _Files:
+    """Several files, one after the other, as one bag."""
+
+    def __init__(self, bags: list):
+        self.bags = bags
+
+    @property
+    def connections(self) -> list:
+        return [connection for bag in self.bags for connection in bag.connections]
+
+    def messages(self, connections, start: int | None = None) -> Iterator[tuple]:
+        topics = {connection.topic for connection in connections}
+        for bag in self.bags:
+            if own := [entry for entry in bag.connections if entry.topic in topics]:
+                yield from bag.messages(own, start)
 
 
 def _only(path: Path, found: list[str], topics: dict[str, str]) -> str:
@@ -231,14 +284,81 @@ def _evt3(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, .
         raise damage
 
 
-DECODERS = {"evt3": _evt3, "mono": _mono}
+def _libcaer_cmp(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, ...]]]:
+    """Alone until the first event is known, whose stamp counts; then many messages at once."""
+    state, waiting, count, started = libcaer.State(), [], 0, False
+    damage = None
+
+    def decode():
+        words = [np.frombuffer(packet.payload, packet.words + "u2") for packet in waiting]
+        starts = np.cumsum([0, *map(len, words)])[:-1]
+        bases = np.array([_to_microseconds(packet.time_base) for packet in waiting], np.int64)
+        return libcaer.decode(state, np.concatenate(words).astype(np.uint16), starts, bases)
+
+    try:
+        for packet in packets:
+            waiting.append(packet)
+            count += len(packet.payload)
+            if started and count < 2 * WORDS:
+                continue
+            state, columns = decode()
+            waiting, count, started = [], 0, started or len(columns[0]) > 0
+            yield packet.stamp, columns
+    except Exception as error:  # whatever a library says of damage: after what came before it
+        damage = error
+    if waiting:
+        yield 0, decode()[1]
+    if damage is not None:
+        raise damage
+
+
+def _libcaer(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, ...]]]:
+    for packet in packets:
+        base = _to_microseconds(packet.time_base)
+        yield packet.stamp, libcaer.decode_plain(packet.payload, base)
+
+
+def _to_microseconds(nanoseconds: int) -> int:
+    """Raises ValueError for what is no time: it has 64 bits."""
+    if nanoseconds >= 1 << 63:
+        raise ValueError(f"a message starts at {nanoseconds} ns")
+    return (nanoseconds + 500) // 1000
+
+
+DECODERS = {"evt3": _evt3, "libcaer": _libcaer, "libcaer_cmp": _libcaer_cmp, "mono": _mono}
+
+
+def _triggers(path: Path, topic: str) -> Triggers | None:
+    """Edges among the words of EVT3, moved as the events are."""
+
+    def pieces():
+        state, ahead, shift, waiting, found = evt3.State(), evt3.State(), None, bytearray(), []
+        with contextlib.suppress(Exception), _bag(path) as bag:  # events will say so
+            for _, raw in _raw(bag, topic):
+                packet = _packet(_Message(raw, not _is_ros1(path)))
+                if packet.encoding != "evt3":
+                    break
+                words = np.frombuffer(packet.payload, packet.words + "u2").astype(np.uint16)
+                if shift is None:
+                    state, columns = evt3.decode(state, words)
+                    shift = packet.stamp - int(columns[0][0]) if len(columns[0]) else None
+                waiting += words.tobytes()
+                if len(waiting) >= 2 * WORDS:
+                    ahead, edges = evt3.triggers(ahead, np.frombuffer(bytes(waiting), np.uint16))
+                    waiting = bytearray()
+                    found.append(edges)
+        found.append(evt3.triggers(ahead, np.frombuffer(bytes(waiting), np.uint16))[1])
+        if shift is not None:
+            yield from ((times + shift, ids, rises) for times, ids, rises in found)
+
+    return all_triggers(pieces())
 
 
 def _frames(path: Path, bag, topic: str | None) -> Frames | None:
     if topic is None:
         return None
     stamps, recorded, ros2 = [], [], not _is_ros1(path)
-    with contextlib.suppress(ValueError if isinstance(bag, Torn) else ()):  # events will say so
+    try:
         for time, raw in _raw(bag, topic):
             message = _Message(raw, ros2)
             stamps.append(message.header())
@@ -246,6 +366,10 @@ def _frames(path: Path, bag, topic: str | None) -> Frames | None:
                 logger.warning("%s: images of %s are %s: no frames", path, topic, encoding)
                 return None
             recorded.append(time)
+    except Exception as error:  # damaged bytes reach every kind; of a torn bag, events will say so
+        if not isinstance(bag, tuple(TORN.values())):
+            found = " ".join(str(error).split())
+            logger.warning("%s: reads %d images of %s (%s)", path, len(recorded), topic, found)
 
     def read(i: int) -> np.ndarray:
         with reading(path, Exception), _bag(path) as bag:
@@ -255,7 +379,7 @@ def _frames(path: Path, bag, topic: str | None) -> Frames | None:
                     return _picture(path, message)
         raise RecordingError(f"{path}: frame {i + 1} of {topic} is not there any more")
 
-    return Frames(np.array(stamps, np.int64), read) if stamps else None
+    return Frames(np.array(stamps[: len(recorded)], np.int64), read) if recorded else None
 
 
 def _encoding(message: _Message) -> str:

@@ -1,0 +1,205 @@
+"""AEDAT-3.1 -> Source: the file of cAER and of DV before it had its own, packets of one kind each.
+
+    #...             lines of text (aedat.py): `#Format: RAW`, `#Source 1: DAVIS240C`
+    28 bytes         int16 kind, int16 source, int32: size of an entry, place of its time in it,
+                     how often the times' 31 bits have started again, capacity, entries, valid ones
+    entries          little-endian; bit 0 of each says whether it is valid, and others are left out
+        0 special    uint32: kind (bits 1-7), int32 time: an edge at a trigger input, and others
+        1 polarity   uint32: polarity (bit 1), y (2-16), x (17-31), int32 time
+        2 frame      uint32: channels (1-3), int32 times of the frame's begin and end and of its
+                     exposure's, width, height, column and row of its corner, uint16 pixels
+        others       are passed over
+
+Times are microseconds; a frame is at the middle of its exposure. Of several cameras the first with
+events is read. Frames of parts of the sensor are passed over.
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+
+from firenet_jax.events import Events, Frames, RecordingError, Rows, Triggers
+from firenet_jax.readers import Source, aedat, all_triggers, joined, reading, to_events, to_frame
+
+SPECIAL, POLARITY, FRAME = 0, 1, 2
+HEAD = np.dtype(
+    [
+        ("kind", "<i2"), ("source", "<i2"), ("size", "<i4"), ("time", "<i4"), ("wraps", "<i4"),
+        ("capacity", "<i4"), ("count", "<i4"), ("valid", "<i4"),
+    ]
+)  # fmt: skip
+EVENT = np.dtype([("data", "<u4"), ("t", "<i4")])
+FRAME_HEAD = np.dtype(
+    [("info", "<u4"), ("begin", "<i4"), ("end", "<i4"), ("open", "<i4"), ("shut", "<i4"),
+     ("width", "<i4"), ("height", "<i4"), ("x", "<i4"), ("y", "<i4")]
+)  # fmt: skip
+# special kinds: (input, whether the edge rises); a pulse counts as a rising edge
+EDGES = {2: (0, 1), 3: (0, 0), 4: (0, 1), 6: (1, 1), 7: (1, 0), 8: (1, 1), 9: (2, 1), 10: (2, 0),
+         11: (2, 1)}  # fmt: skip
+PIECE = 1 << 18  # events of a packet that are taken at once
+
+
+class Packet(NamedTuple):
+    kind: int
+    source: int
+    size: int  # bytes of an entry
+    wraps: int
+    count: int
+    place: int  # of the first entry, bytes from the beginning of the file
+
+
+class Layout(NamedTuple):
+    """What is known of a file before its events are read."""
+
+    path: Path
+    begin: int  # of the packets
+    source: int  # the camera
+
+
+def matches(path: Path) -> bool:
+    return (aedat.version(path) or "").startswith("3.") or (
+        path.is_file() and path.suffix.lower() == ".aedat3"
+    )
+
+
+def read(path: Path) -> Source:
+    version = aedat.version(path)
+    if version != "3.1":
+        raise RecordingError(
+            f"{path}: is AEDAT-{version or 'of no version'}, expected 3.1: convert it with DV"
+        )
+    with open(path, "rb") as file:
+        lines = aedat.read_header(file)
+        begin = file.tell()
+    header = "\n".join(lines)
+    stored = re.search(r"^#Format: *(\S+)", header, re.M)
+    if stored is not None and stored[1].upper() != "RAW":
+        raise RecordingError(
+            f"{path}: its packets are stored as {stored[1]}, expected RAW: convert it with DV"
+        )
+    layout = Layout(path, begin, _camera(path, begin))
+    name = re.search(rf"^#Source {layout.source}: *(.+)$", header, re.M)
+    return Source(
+        "AEDAT-3.1",
+        lambda: joined(_events(layout)),
+        None if name is None else aedat.sensor_size(name[1]),
+        frames=_frames(layout),
+        grey=name is not None and aedat.is_grey(name[1]),
+        triggers=lambda: _triggers(layout),
+    )
+
+
+def _camera(path: Path, begin: int) -> int:
+    with open(path, "rb") as file:
+        found = next(
+            (p for p in _packets(path, file, begin) if p.kind == POLARITY and p.count), None
+        )
+    if found is None:
+        raise RecordingError(
+            f"{path}: holds no events: check that it was recorded and copied whole"
+        )
+    return found.source
+
+
+def _packets(path: Path, file: BinaryIO, begin: int) -> Iterator[Packet]:
+    """Of all kinds; the file is left anywhere. Raises RecordingError where no whole one is."""
+    at, end = begin, path.stat().st_size
+    while at < end:
+        file.seek(at)
+        data = file.read(HEAD.itemsize)
+        head = np.frombuffer(data, HEAD)[0] if len(data) == HEAD.itemsize else None
+        size, count = (0, 0) if head is None else (int(head["size"]), int(head["count"]))
+        place = at + HEAD.itemsize
+        if head is None or size <= 0 or count < 0 or place + size * count > end:
+            raise RecordingError(
+                f"{path}: cannot be read from byte {at} on, where no whole packet is: the file is "
+                "cut off or damaged: copy or download it again"
+            )
+        yield Packet(int(head["kind"]), int(head["source"]), size, int(head["wraps"]), count, place)
+        at = place + size * count
+
+
+def _of_kind(layout: Layout, kind: int) -> Iterator[tuple[Packet, BinaryIO]]:
+    with open(layout.path, "rb") as file:
+        for packet in _packets(layout.path, file, layout.begin):
+            if packet.kind == kind and packet.source == layout.source:
+                yield packet, file
+
+
+def _columns(layout: Layout, kind: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """(data uint32, times int64) of the valid entries of a kind of 8 bytes each"""
+    for packet, file in _of_kind(layout, kind):
+        if packet.size != EVENT.itemsize:
+            raise RecordingError(
+                f"{layout.path}: has entries of {packet.size} bytes at byte {packet.place}, "
+                f"expected {EVENT.itemsize}: the file is damaged: copy or download it again"
+            )
+        for first in range(0, packet.count, PIECE):
+            count = min(PIECE, packet.count - first)
+            file.seek(packet.place + first * packet.size)
+            entries = np.frombuffer(file.read(count * packet.size), EVENT)
+            entries = entries[entries["data"] & 1 > 0]
+            yield entries["data"], entries["t"].astype(np.int64) + (packet.wraps << 31)
+
+
+def _events(layout: Layout) -> Iterator[Events | Rows]:
+    row = 0
+    for data, t in _columns(layout, POLARITY):
+        yield to_events(layout.path, row, t, data >> 17, data >> 2 & 0x7FFF, data >> 1 & 1)
+        row += len(t)
+
+
+def _triggers(layout: Layout) -> Triggers | None:
+    def pieces():
+        for data, t in _columns(layout, SPECIAL):
+            kinds = (data >> 1 & 0x7F).tolist()
+            edges = [(time, *EDGES[k]) for time, k in zip(t, kinds, strict=True) if k in EDGES]
+            yield np.array(edges, np.int64).reshape(-1, 3).T
+
+    return all_triggers(pieces())
+
+
+def _frames(layout: Layout) -> Frames | None:
+    """Up to the first that is damaged: whoever reads the events will hear of it."""
+    times, places = [], []
+    try:
+        for packet, file in _of_kind(layout, FRAME):
+            for place in range(
+                packet.place, packet.place + packet.size * packet.count, packet.size
+            ):
+                head = _frame_head(file, place, packet.size)
+                if head["info"] & 1 and head["x"] == head["y"] == 0:
+                    begin, end = int(head["open"]), int(head["shut"])
+                    times.append((begin + end) // 2 + (packet.wraps << 31))
+                    places.append((place, packet.size))
+    except (RecordingError, ValueError):
+        pass
+    if not places:
+        return None
+    return Frames(np.array(times, np.int64), lambda i: _frame(layout.path, *places[i]))
+
+
+def _frame_head(file: BinaryIO, place: int, size: int) -> np.void:
+    """Raises ValueError where its pixels do not fit into the entry."""
+    file.seek(place)
+    head = np.frombuffer(file.read(min(size, FRAME_HEAD.itemsize)), FRAME_HEAD)[0]
+    height, width, channels = int(head["height"]), int(head["width"]), _channels(head)
+    room = size - FRAME_HEAD.itemsize
+    if min(height, width) < 1 or channels not in (1, 3, 4) or 2 * height * width * channels > room:
+        raise ValueError(f"a frame of {width}x{height} pixels in {size} bytes")
+    return head
+
+
+def _channels(head: np.void) -> int:
+    return int(head["info"]) >> 1 & 7
+
+
+def _frame(path: Path, place: int, size: int) -> np.ndarray:
+    with open(path, "rb") as file, reading(path, ValueError, IndexError):
+        head = _frame_head(file, place, size)
+        shape = int(head["height"]), int(head["width"]), _channels(head)
+        pixels = np.frombuffer(file.read(2 * int(np.prod(shape))), "<u2").reshape(shape)
+    return to_frame((pixels >> 8).astype(np.uint8), path)

@@ -1,0 +1,80 @@
+"""Payloads of ROS's driver for iniVation's cameras -> columns: event_camera_msgs' encodings
+
+libcaer        8 bytes an event: uint32 polarity (bit 1), y (2-16), x (17-31), int32 microseconds
+libcaer_cmp    16 bits a word, much as EVT3 with rows and columns exchanged:
+
+    bits 15-12   bits 11-0
+    0  time high    bits 23-12 of the time, microseconds
+    1  time low     bits 11-0 of the time
+    2  column       x (bits 10-0)
+    3  event        polarity (bit 11), y (bits 10-0)
+    4  vector base  polarity (bit 11), y (bits 10-0) of the vectors that follow
+    5  vector of 8  bit i: an event at base + i; then the base moves on by 8
+
+Times are counted from the time_base of their message, where those of libcaer_cmp start from 0. So
+does event_camera_codecs decode them.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from firenet_jax.readers import unwrap
+
+EVENT = np.dtype([("data", "<u4"), ("t", "<i4")])
+
+
+class State(NamedTuple):
+    """What a message leaves to the next one; -1: not known yet."""
+
+    x: int = -1
+    base: int = -1  # row of the next vector's bit 0
+    base_on: int = 0
+
+
+def decode(
+    state: State, words: np.ndarray, starts: np.ndarray, time_bases: np.ndarray
+) -> tuple[State, tuple[np.ndarray, ...]]:
+    """Messages of libcaer_cmp, one behind the other: (N,) uint16, (M,) the first word of each
+    message, (M,) int64 microseconds -> state behind them, (t, x, y, p): int64 microseconds, column,
+    row, 0 or 1. Events before the first column or base are left out: their place is unknown."""
+    kind, load = words >> 12, (words & 0xFFF).astype(np.int64)
+    place = np.arange(len(words))
+    message = np.searchsorted(starts, place, side="right") - 1
+    time = np.zeros(len(words), np.int64)
+    for code, shift in ((0, 12), (1, 0)):
+        last = np.maximum.accumulate(np.where(kind == code, place, -1))
+        time += np.where(last >= starts[message], load[last] << shift, 0)
+    time += time_bases[message]
+
+    is_column = kind == 2
+    columns = np.append(state.x, load[is_column] & 0x7FF)
+    x = columns[np.cumsum(is_column)]
+
+    is_base = kind == 4
+    base = np.cumsum(is_base)
+    bases = np.append(state.base, load[is_base] & 0x7FF)
+    polarities = np.append(state.base_on, load[is_base] >> 11)
+    vector, single = kind == 5, kind == 3
+    moved = 8 * np.cumsum(vector)
+    moved -= np.append(0, moved[is_base])[base]  # since the base was set, this word included
+
+    entries = np.flatnonzero((x >= 0) & (single | vector & (bases[base] >= 0)))
+    # A single event is a vector with one bit, at its own row.
+    single, base = single[entries], base[entries]
+    first = np.where(single, load[entries] & 0x7FF, bases[base] + moved[entries] - 8)
+    on = np.where(single, load[entries] >> 11, polarities[base])
+    bits = np.where(single, 1, load[entries] & 0xFF)
+    entry, bit = np.nonzero(bits[:, None] >> np.arange(8) & 1)
+    entries = entries[entry]
+    next_base = bases[-1] + (moved[-1] if words.size and bases[-1] >= 0 else 0)
+    state = State(*map(int, (columns[-1], next_base, polarities[-1])))
+    return state, (time[entries], x[entries], first[entry] + bit, on[entry])
+
+
+def decode_plain(payload: bytes, time_base: int) -> tuple[np.ndarray, ...]:
+    """A message of libcaer, its time_base in microseconds -> (t, x, y, p), as above."""
+    events = np.frombuffer(payload, EVENT, len(payload) // EVENT.itemsize)
+    data, t = events["data"], events["t"].astype(np.int64)
+    t = time_base + (unwrap(t, 31, int(t[0])) if t.size else t)
+    return t, data >> 17, data >> 2 & 0x7FFF, data >> 1 & 1
