@@ -1,4 +1,4 @@
-"""Weights <-> disk: one small .npz; published PyTorch checkpoints -> weights.
+"""Weights <-> disk: one small .npz; published PyTorch checkpoints -> weights, and back.
 
 A .npz holds the parameters under flat names ("gru1/gates/kernel", float32, kernels
 (rows, columns, in, out)), `normalise` (bool: the network expects normalised tensors) and
@@ -247,3 +247,24 @@ def convert(path: str | Path) -> Weights:
 
     refuse_unused(tensors, prefix, path, "FireNet", TRY)
     return Weights(params=_unflatten(flat), normalise=names.normalise)
+
+
+def original_names(weights: Weights) -> tuple[str, dict[str, np.ndarray]]:
+    """Weights -> (FireNet or FireNet+, the state dict that `convert` reads): HWIO -> OIHW.
+
+    Raises CheckpointError where the arrays are not FireNet's or not finite.
+    """
+    flat = _flatten(weights.params)
+    _check(Path("these weights"), flat, "cannot be written")
+    family = next(name for name, names in FAMILIES.items() if names.normalise == weights.normalise)
+    prefix = "net." if family == "FireNet" else ""
+    tensors = {}
+    for layer in LAYERS:
+        block, _, part = layer.partition("/")
+        sources = [FAMILIES[family].blocks[block] + ending for ending in PARTS[part]]
+        kernels = np.split(flat[f"{layer}/kernel"].transpose(3, 2, 0, 1), len(sources))
+        biases = np.split(flat[f"{layer}/bias"], len(sources))
+        for source, kernel, bias in zip(sources, kernels, biases, strict=True):
+            tensors[f"{prefix}{source}.weight"] = np.ascontiguousarray(kernel)
+            tensors[f"{prefix}{source}.bias"] = np.ascontiguousarray(bias)
+    return family, tensors

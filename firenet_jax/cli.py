@@ -37,6 +37,11 @@ COMMANDS = {
         "methods beside camera frames -> report",
     ),
     "convert": ("firenet_jax.commands.convert", "Convert", "PyTorch checkpoint -> weights.npz"),
+    "export": (
+        "firenet_jax.commands.export",
+        "Export",
+        "weights -> ONNX, StableHLO, PyTorch, safetensors",
+    ),
 }
 
 

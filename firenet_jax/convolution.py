@@ -25,7 +25,8 @@ def _plain(image: jax.Array, kernel: jax.Array) -> jax.Array:
 
 def _convolve(image: jax.Array, kernel: jax.Array) -> jax.Array:
     _, columns, inputs, outputs = kernel.shape
-    if columns == 1 or inputs * outputs > 16 * 16:
+    known = isinstance(image.shape[2], int)  # not in what is exported for any width
+    if columns == 1 or inputs * outputs > 16 * 16 or not known:
         return _plain(image, kernel)
     # Quickest on a CPU: 2 of 2, 3, 4 with 16 inputs; 4 with the event tensor's 5.
     beside = partial(side_by_side, pixels=2 if inputs >= 16 else 4)

@@ -60,6 +60,14 @@ def _unsharp_weights() -> np.ndarray:
     return (weights / weights.sum()).astype(np.float32)
 
 
+def unsharp_kernel(amount: float) -> np.ndarray:
+    """(5, 5) float32: with it, `unsharp_mask` is one convolution, for programs of others."""
+    weights = _unsharp_weights()
+    kernel = -amount * np.outer(weights, weights)
+    kernel[2, 2] += 1 + amount
+    return kernel.astype(np.float32)
+
+
 def unsharp_mask(images: jax.Array, amount: float) -> jax.Array:
     """(..., H, W) -> (1 + amount) image - amount blurred; 5x5 kernel, zeros beyond the border."""
     blurred = images

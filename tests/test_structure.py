@@ -21,7 +21,7 @@ LAYERS = [
     ["storage", "windows", "network"],
     ["readers", "tensors", "checkpoint", "filters"],
     ["reconstruction", "simulation"],
-    ["evaluation"],
+    ["evaluation", "export"],
     ["training"],
     ["commands"],
     ["cli"],
@@ -33,7 +33,8 @@ DOORS = {
     "h5py": {"readers", "training.batches", "commands.simulate", "commands.evaluate"},
     "pyarrow": {"readers"}, "grain": {"training.batches"}, "faery": {"readers"},
     "rosbags": {"readers"}, "hdf5plugin": {"readers"}, "skimage": {"evaluation.equalise"},
-    "llvmlite": {"native"},
+    "llvmlite": {"native"}, "onnx": {"export"}, "safetensors": {"export"},
+    "flatbuffers": {"export"},
 }  # fmt: skip
 
 

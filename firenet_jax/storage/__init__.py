@@ -5,6 +5,7 @@ Knows nothing of the network and its data. Read `files` first.
     files          each file is made beside its name and gets it in the end; locks; settings
     video          pictures -> a folder of png, mp4, gif
     pytorch_file   PyTorch's files -> numpy arrays, running nothing that they hold
+    pytorch_save   numpy arrays -> PyTorch's files
     overlap        an iterator, run ahead in a thread
     progress       bars, and lines where there is no terminal
 """

@@ -1,0 +1,16 @@
+# The wheel alone -> an image that runs `firenet` on a CPU.
+#
+#   python -m build
+#   docker build -f docker/cpu.Dockerfile -t firenet .
+#   docker run --rm -v "$PWD:/data" firenet reconstruct recording.zip -o video.mp4
+FROM python:3.13-slim
+
+COPY dist/firenet_jax-*.whl /tmp/
+RUN pip install --no-cache-dir "$(ls /tmp/firenet_jax-*.whl)[formats]" && rm /tmp/firenet_jax-*.whl
+
+# What is written belongs to nobody's root; name yourself with --user "$(id -u):$(id -g)".
+RUN useradd --create-home firenet
+USER firenet
+WORKDIR /data
+ENTRYPOINT ["firenet"]
+CMD ["--help"]

@@ -1,0 +1,132 @@
+"""Weights -> a file for other programs: .onnx, .stablehlo, .pth, .safetensors; or a web page."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import numpy as np
+import tyro
+
+from firenet_jax.checkpoint import BUILT_IN, load_weights
+from firenet_jax.commands.demo import Demo, make_scene
+from firenet_jax.events import Events, concatenate
+from firenet_jax.export.onnx_model import onnx_model
+from firenet_jax.export.stablehlo import stablehlo
+from firenet_jax.export.tensors_file import pth, safetensors
+from firenet_jax.export.web_page import RUNTIME, runtime_version, write_page
+from firenet_jax.readers import open_recording
+from firenet_jax.simulation.scenes import rendering_times, video
+from firenet_jax.simulation.sensor import event_list
+from firenet_jax.storage.files import OutputError, partial_name, writing
+
+SIMULATED = 120, 160  # height, width
+KINDS = ".onnx", ".stablehlo", ".pth", ".safetensors"
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write weights as a file that other programs run or load.
+
+    .onnx is the network for onnxruntime, TensorRT, OpenVINO and browsers; .stablehlo for a process
+    with jax alone; .pth for rpg_e2vid, EVREAL and other programs in PyTorch; .safetensors the same
+    tensors, which many libraries read. onnx, safetensors and flatbuffers are the extra `export`.
+
+    Examples:
+      firenet export -o firenet.onnx --picture
+      firenet export run -o model.pth
+      firenet export --web page --sample recording.zip
+    """
+
+    weights: tyro.conf.Positional[Path] = Path(BUILT_IN)
+    """A training run, .npz or published checkpoint; the built-in weights if not given."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """A name that ends in .onnx, .stablehlo, .pth or .safetensors."""
+    normalise: bool = True
+    """.onnx and .stablehlo: normalise event tensors inside, if the weights ask for it."""
+    picture: bool = False
+    """.onnx and .stablehlo: give the sharpened 8-bit picture too."""
+    web: Path | None = None
+    """Folder of a web page to write: a recording dropped onto it becomes video in the browser."""
+    runtime: Path = Path("node_modules") / RUNTIME
+    """--web: folder of onnxruntime-web, where `npm install onnxruntime-web` has put it."""
+    sample: Path | None = None
+    """--web: recording whose first seconds the page begins with; else a simulated one."""
+    overwrite: bool = False
+    """Replace an output that exists."""
+
+
+SAMPLE = 500_000  # events: some seconds, one or two megabytes
+
+
+def run(settings: Export) -> None:
+    if settings.web is None and settings.output is None:
+        raise OutputError("nothing to write: pass -o and a name such as model.onnx, or --web")
+    if settings.web is not None:
+        write_web(settings)
+    if settings.output is not None:
+        write_file(settings)
+
+
+def write_web(settings: Export) -> None:
+    folder = settings.web
+    if folder.exists() and not settings.overwrite and any(folder.iterdir()):
+        raise OutputError(f"{folder} exists; choose another name or pass --overwrite")
+    version = runtime_version(settings.runtime)
+    weights = load_weights(settings.weights)
+    if settings.sample is None:
+        (height, width), events = SIMULATED, simulated(*SIMULATED, seconds=2.0)
+    else:
+        recording = open_recording(settings.sample)
+        (height, width), events = (recording.height, recording.width), recording.events()
+    held, size = [], 0
+    for chunk in events:
+        held.append(chunk.select(slice(SAMPLE - size)))
+        size += len(held[-1])
+        if size >= SAMPLE:
+            break
+    write_page(folder, weights, concatenate(held), height, width, settings.runtime)
+    print(
+        f"{folder}: a page with onnxruntime-web {version} and a sample of {size:,} events; "
+        f"python -m http.server -d {folder} shows it at localhost:8000"
+    )
+
+
+def simulated(height: int, width: int, seconds: float) -> Iterator[Events]:
+    """The scene of `firenet demo`, as a clean sensor's events."""
+    demo = Demo(Path("demo.mp4"), seconds=seconds, sensor_size=f"{width}x{height}")
+    sensor, scene = (
+        jax.tree.map(lambda leaf: leaf[0], one) for one in make_scene(demo, height, width)
+    )
+    bounds = np.array([0, round(1e6 * seconds)])
+    times = rendering_times(scene, bounds, height=height, width=width)
+    return event_list(sensor, video(scene, times, height=height, width=width))
+
+
+def write_file(settings: Export) -> None:
+    path = settings.output
+    if path.suffix not in KINDS:
+        raise OutputError(f"{path}: cannot write {path.suffix or 'such'} files; try {KINDS}")
+    runs = path.suffix in (".onnx", ".stablehlo")
+    if not runs and (settings.picture or not settings.normalise):
+        raise OutputError(
+            f"{path} holds weights alone: --picture and --no-normalise are for .onnx and .stablehlo"
+        )
+    if path.exists() and not settings.overwrite:
+        raise OutputError(f"{path} exists; choose another name or pass --overwrite")
+    weights = load_weights(settings.weights)
+    inside = {"normalise": settings.normalise, "picture": settings.picture}
+    content = {
+        ".onnx": lambda: onnx_model(weights, **inside).SerializeToString(),
+        ".stablehlo": lambda: stablehlo(weights, **inside),
+        ".pth": lambda: pth(weights),
+        ".safetensors": lambda: safetensors(weights),
+    }[path.suffix]()
+    beside = partial_name(path)
+    with writing(path):
+        beside.write_bytes(content)
+        beside.replace(path)
+    normalised = weights.normalise and not (runs and settings.normalise)
+    tensors = "normalised" if normalised else "raw"
+    print(f"{path}: {len(content) / 1000:.0f} kB, for {tensors} event tensors")

@@ -1,0 +1,194 @@
+// A dropped file -> events -> windows -> event tensors; as the Python package does it.
+//
+// Events are columns {t, x, y, p, width, height}: t Float64Array of whole microseconds, x and y
+// Uint16Array, p Uint8Array (1 is ON). Event tensors are Float32Array (5, height, width).
+
+export const BINS = 5;
+const NAMES = {
+  t: ["t", "ts", "time", "times", "timestamp", "timestamps"], x: ["x", "xs"], y: ["y", "ys"],
+  p: ["p", "ps", "pol", "polarity", "on"],
+};
+const column = (name) => Object.keys(NAMES).find((key) => NAMES[key].includes(name)) ?? "";
+
+// ---- files
+
+/** Uint8Array and its file's name -> events. Throws an Error of one sentence. */
+export async function readRecording(bytes, name) {
+  const lower = name.toLowerCase();
+  if (lower.endsWith(".gz")) return readRecording(await inflated(bytes, "gzip"), name.slice(0, -3));
+  if (lower.endsWith(".npz")) return fromColumns(await npz(bytes, name), name);
+  if (lower.endsWith(".npy")) return fromRows(npy(bytes, name), name);
+  if (lower.endsWith(".zip")) {
+    const members = zipMembers(bytes, name).filter((m) => !m.name.startsWith("__MACOSX/"));
+    const texts = members.filter((m) => /\.(txt|csv)$/i.test(m.name));
+    const chosen = texts.find((m) => m.name.endsWith("events.txt")) ?? texts[0];
+    if (!chosen) throw new Error(`${name}: no .txt or .csv is in this zip`);
+    return fromText(await unzipped(bytes, chosen), name);
+  }
+  if (/\.(txt|csv)$/.test(lower)) return fromText(bytes, name);
+  throw new Error(`${name}: expected .txt, .csv, .zip, .gz, .npz or .npy`);
+}
+
+async function inflated(bytes, format) {
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream(format));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+/** Zip -> [{name, method, start, size}], from the list at its end (APPNOTE.TXT 4.3). */
+function zipMembers(bytes, name) {
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  let end = bytes.length - 22;
+  while (end >= 0 && view.getUint32(end, true) !== 0x06054b50) end--;
+  if (end < 0) throw new Error(`${name}: is damaged or cut short, its list of files is missing`);
+  const members = [];
+  let at = view.getUint32(end + 16, true);
+  for (let n = view.getUint16(end + 10, true); n > 0; n--) {
+    const [named, extra, comment] = [28, 30, 32].map((k) => view.getUint16(at + k, true));
+    const local = view.getUint32(at + 42, true);
+    members.push({
+      name: new TextDecoder().decode(bytes.subarray(at + 46, at + 46 + named)),
+      method: view.getUint16(at + 10, true),
+      size: view.getUint32(at + 20, true),
+      start: local + 30 + view.getUint16(local + 26, true) + view.getUint16(local + 28, true),
+    });
+    at += 46 + named + extra + comment;
+  }
+  return members;
+}
+
+async function unzipped(bytes, member) {
+  const packed = bytes.subarray(member.start, member.start + member.size);
+  return member.method === 0 ? packed : inflated(packed, "deflate-raw");
+}
+
+async function npz(bytes, name) {
+  const columns = {};
+  for (const member of zipMembers(bytes, name)) {
+    const short = member.name.replace(/\.npy$/, "");
+    const key = column(short) || short;
+    if ([..."txyp", "width", "height"].includes(key))
+      columns[key] = npy(await unzipped(bytes, member), `${name}, ${member.name}`);
+  }
+  return columns;
+}
+
+/** A .npy of numbers -> {data, shape, whole}. */
+function npy(bytes, name) {
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  const long = bytes[6] > 1;
+  const start = (long ? 12 : 10) + (long ? view.getUint32(8, true) : view.getUint16(8, true));
+  const head = new TextDecoder().decode(bytes.subarray(0, start));
+  const type = /'descr': '[<|]([fiub][1248])'/.exec(head)?.[1];
+  const shape = /'shape': \(([^)]*)\)/.exec(head)?.[1].split(",").filter((s) => s.trim()).map(Number);
+  const kinds = {
+    f4: Float32Array, f8: Float64Array, i1: Int8Array, i2: Int16Array, i4: Int32Array,
+    i8: BigInt64Array, u1: Uint8Array, u2: Uint16Array, u4: Uint32Array, u8: BigUint64Array,
+    b1: Uint8Array,
+  };
+  if (!type || !shape || head.includes("True"))
+    throw new Error(`${name}: expected an array of numbers in C order`);
+  let data = new kinds[type](bytes.slice(start).buffer);
+  if (type.endsWith("8") && type !== "f8") data = Float64Array.from(data, Number);
+  return { data, shape, whole: type[0] !== "f" };
+}
+
+function fromRows({ data, shape, whole }, name) {
+  if (shape.length !== 2 || shape[1] !== 4) throw new Error(`${name}: expected rows of t, x, y, p`);
+  const of = (k) => ({ data: Float64Array.from({ length: shape[0] }, (_, n) => data[4 * n + k]), whole });
+  return fromColumns({ t: of(0), x: of(1), y: of(2), p: of(3) }, name);
+}
+
+function fromColumns(columns, name) {
+  for (const key of "txyp")
+    if (!columns[key]) throw new Error(`${name}: expected arrays t, x, y and p; ${key} is missing`);
+  const scale = columns.t.whole ? 1 : 1e6; // microseconds, or seconds
+  const [width, height] = ["width", "height"].map((side) => Number(columns[side]?.data[0] ?? 0));
+  const t = Float64Array.from(columns.t.data, (time) => Math.round(time * scale));
+  return checked({ t, x: columns.x.data, y: columns.y.data, p: columns.p.data, width, height }, name);
+}
+
+/** Lines `t x y p`, perhaps after a line `width height` or one of names. */
+function fromText(bytes, name) {
+  const lines = new TextDecoder().decode(bytes).split("\n");
+  const words = (line) => line.trim().split(/[\s,;]+/);
+  let [first, width, height, order] = [0, 0, 0, [0, 1, 2, 3]];
+  for (; first < lines.length; first++) {
+    const found = words(lines[first]);
+    if (found.length === 2 && found.every((word) => /^\d+$/.test(word))) [width, height] = found.map(Number);
+    else if (/[a-z]/i.test(found[0]) && found.length >= 4) {
+      const named = found.map((word) => column(word.toLowerCase()));
+      order = [..."txyp"].map((key) => named.indexOf(key));
+      if (order.includes(-1)) throw new Error(`${name}: expected columns t, x, y and p, found ${found}`);
+    } else if (found.length >= 4) break;
+    else if (found[0] && !found[0].startsWith("%") && !found[0].startsWith("#"))
+      throw new Error(`${name}, line ${first + 1}: expected t x y p, found ${found.slice(0, 6)}`);
+  }
+  const seconds = lines.slice(first, first + 1000).some((line) => words(line)[order[0]]?.includes("."));
+  const rows = lines.length - first;
+  const made = { t: new Float64Array(rows), x: new Float64Array(rows), y: new Float64Array(rows), p: new Float64Array(rows) };
+  let count = 0;
+  for (let n = first; n < lines.length; n++) {
+    const found = words(lines[n]);
+    if (!found[0]) continue;
+    const [t, x, y, p] = order.map((k) => Number(found[k]));
+    if (Number.isNaN(t + x + y + p)) throw new Error(`${name}, line ${n + 1}: expected t x y p, found ${found.slice(0, 6)}`);
+    made.t[count] = Math.round(seconds ? t * 1e6 : t);
+    [made.x[count], made.y[count], made.p[count++]] = [x, y, p];
+  }
+  for (const key of "txyp") made[key] = made[key].subarray(0, count);
+  return checked({ ...made, width, height }, name);
+}
+
+function checked({ t, x, y, p, width, height }, name) {
+  const count = t.length;
+  if (!count || [x, y, p].some((c) => c.length !== count))
+    throw new Error(`${name}: holds no events, or columns of different lengths`);
+  let [right, bottom] = [0, 0];
+  for (let n = 0; n < count; n++) {
+    if (n && t[n] < t[n - 1]) throw new Error(`${name}, event ${n}: its time goes back`);
+    if (!(x[n] >= 0 && y[n] >= 0 && x[n] < 32768 && y[n] < 32768))
+      throw new Error(`${name}, event ${n}: outside of any sensor`);
+    right = Math.max(right, x[n]);
+    bottom = Math.max(bottom, y[n]);
+  }
+  [width, height] = [width || right + 1, height || bottom + 1];
+  if (right >= width || bottom >= height)
+    throw new Error(`${name}: an event lies outside of the sensor of ${width}x${height}`);
+  return {
+    t, x: Uint16Array.from(x), y: Uint16Array.from(y), p: Uint8Array.from(p, (v) => (v > 0 ? 1 : 0)),
+    width, height,
+  };
+}
+
+// ---- windows
+
+/** Events -> [start, stop) of each window: 0.35 events per pixel, at most 40 ms or, of a short
+ * recording, a twentieth of it. `count` and `longest` (microseconds) set others. */
+export function windowsOf({ t, width, height }, count, longest) {
+  const span = t[t.length - 1] - t[0];
+  count ??= Math.max(1, Math.round(0.35 * width * height));
+  longest ??= span >= 800_000 ? 40_000 : Math.max(Math.floor(span / 20), 1);
+  const windows = [];
+  for (let start = 0, stop = 0; start < t.length; start = stop) {
+    const most = Math.min(start + count, t.length);
+    while (stop < most && t[stop] < t[start] + longest) stop++;
+    windows.push([start, stop]);
+  }
+  return windows;
+}
+
+/** Eq. 1 of the paper: each event votes into the two bins near its time. */
+export function voxels({ t, x, y, p, width, height }, [start, stop]) {
+  const plane = width * height;
+  const tensor = new Float32Array(BINS * plane);
+  const scale = (BINS - 1) / Math.max(t[stop - 1] - t[start], 1);
+  for (let n = start; n < stop; n++) {
+    const time = (t[n] - t[start]) * scale;
+    const bin = Math.floor(time);
+    const place = bin * plane + y[n] * width + x[n];
+    const sign = p[n] ? 1 : -1;
+    tensor[place] += sign * (bin + 1 - time);
+    if (bin + 1 < BINS) tensor[place + plane] += sign * (time - bin);
+  }
+  return tensor;
+}

@@ -1,0 +1,41 @@
+// Event tensors -> pictures: firenet.onnx in onnxruntime-web, on the GPU (WebGPU) or in wasm.
+
+import { BINS, voxels } from "./events.js";
+
+const CHANNELS = 16;
+
+/** Loads runtime and network once. `gpu` false: wasm even where there is a GPU. */
+export async function load(gpu = "gpu" in navigator) {
+  if (gpu && (await navigator.gpu?.requestAdapter().catch(() => null))) {
+    try {
+      return await open("ort.webgpu.min.mjs", "webgpu");
+    } catch (error) {
+      console.warn("WebGPU does not take the network, wasm does:", error);
+    }
+  }
+  return open("ort.wasm.min.mjs", "wasm");
+}
+
+async function open(file, provider) {
+  const ort = await import(`./ort/${file}`);
+  ort.env.wasm.wasmPaths = new URL("./ort/", import.meta.url).href;
+  const session = await ort.InferenceSession.create(new URL("./firenet.onnx", import.meta.url).href, {
+    executionProviders: [provider],
+  });
+  return { ort, session, provider };
+}
+
+/** Events and windows -> {picture Uint8Array (height, width), tensor, time} one after the other. */
+export async function* reconstruct({ ort, session }, events, windows) {
+  const { width, height, t } = events;
+  const zeros = () =>
+    new ort.Tensor("float32", new Float32Array(CHANNELS * height * width), [1, CHANNELS, height, width]);
+  let [g1, g2] = [zeros(), zeros()];
+  for (const window of windows) {
+    const tensor = voxels(events, window);
+    const input = new ort.Tensor("float32", tensor, [1, BINS, height, width]);
+    const found = await session.run({ events: input, g1, g2 }, ["picture", "g1_next", "g2_next"]);
+    [g1, g2] = [found.g1_next, found.g2_next];
+    yield { picture: found.picture.data, tensor, time: t[window[1] - 1] };
+  }
+}

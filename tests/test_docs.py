@@ -1,0 +1,68 @@
+"""The site: its commands have the options they name, its code runs, its links lead somewhere."""
+
+import importlib
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import tyro
+
+import firenet_jax as fj
+from firenet_jax import cli
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.glob("*.md"))
+
+
+def blocks(page, language):
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+
+
+def commands(page):
+    """`firenet ...` lines: in blocks, and in code inside of a line."""
+    lines = [line for block in blocks(page, "bash") for line in block.splitlines()]
+    lines += re.findall(r"`(firenet [a-z]+ [^`]*)`", page.read_text())
+    return [line for line in lines if line.startswith("firenet ")]
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if commands(p)], ids=lambda page: page.stem)
+def test_commands_have_these_options(page):
+    for line in commands(page):
+        name, *rest = shlex.split(line)[1:]
+        if "--help" in rest or any(word.isupper() or word == "..." for word in rest):
+            continue
+        module, settings, _ = cli.COMMANDS[name]
+        kind = getattr(importlib.import_module(module), settings)
+        try:
+            tyro.cli(kind, args=rest, config=(tyro.conf.OmitArgPrefixes,))
+        except SystemExit:
+            pytest.fail(f"{page.name}: {line}")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_and_pictures_lead_to_files(page):
+    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text()):
+        assert (DOCS / target).exists(), f"{page.name}: {target}"
+
+
+def test_code_compiles_and_knows_the_package():
+    for page in PAGES:
+        for block in blocks(page, "python"):
+            compile(block, page.name, "exec")
+            for name in re.findall(r"\bfj\.(\w+)", block):
+                assert hasattr(fj, name), f"{page.name}: fj.{name}"
+
+
+def test_the_site_documents_every_public_name():
+    named = re.findall(r"^::: firenet_jax\.([\w.]+)$", (DOCS / "api.md").read_text(), re.MULTILINE)
+    for name in named:
+        module, _, last = name.rpartition(".")
+        assert hasattr(importlib.import_module(f"firenet_jax.{module}"), last), name
+    assert {name.rpartition(".")[2] for name in named} >= set(fj.__all__)
+
+
+def test_the_site_has_every_page():
+    config = (ROOT / "mkdocs.yml").read_text()
+    assert all(f": {page.name}\n" in config for page in PAGES)

@@ -1,0 +1,175 @@
+"""The page in a browser: its pictures are those of `firenet reconstruct`."""
+
+import gzip
+import http.server
+import json
+import os
+import shutil
+import subprocess
+import threading
+import zipfile
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from test_cli import firenet
+from test_pipeline import write_recording
+
+from firenet_jax.commands.export import Export, run, simulated
+from firenet_jax.export.web_page import FILES
+
+BROWSERS = "chromium-headless-shell", "chromium", "chromium-browser", "google-chrome"
+
+# Reconstructs each recording, sends its pictures here; then what the page itself says.
+TEST_PAGE = """<!doctype html><iframe id="page" src="index.html"></iframe><script type="module">
+import { readRecording, windowsOf } from "./events.js";
+import { load, reconstruct } from "./network.js";
+const send = (name, body) => fetch(`/${name}`, { method: "POST", body });
+try {
+  const network = await load();
+  for (const name of NAMES) {
+    const bytes = new Uint8Array(await (await fetch(name)).arrayBuffer());
+    const events = await readRecording(bytes, name);
+    const pictures = [];
+    for await (const { picture } of reconstruct(network, events, windowsOf(events)))
+      pictures.push(picture);
+    await send(name, new Blob(pictures));
+  }
+  for (const name of BAD) {
+    const bytes = new Uint8Array(await (await fetch(name)).arrayBuffer());
+    const said = await readRecording(bytes, name).then(() => "nothing", (error) => error.message);
+    await send(name, said);
+  }
+  const page = document.getElementById("page").contentDocument;
+  while (!/picture/.test(page.body.querySelector("[role=status]").textContent))
+    await new Promise((go) => setTimeout(go, 100));
+  await send("page", page.body.querySelector("[role=status]").textContent
+    + page.body.querySelector("[role=alert]").textContent);
+} catch (error) { await send("failed", String(error.stack)); }
+await send("done", "");
+</script>"""
+
+
+class Server(http.server.SimpleHTTPRequestHandler):
+    """Files of a folder; keeps what is posted."""
+
+    def __init__(self, *arguments, posted, done, **options):
+        self.posted, self.done = posted, done
+        super().__init__(*arguments, **options)
+
+    def do_POST(self):
+        self.posted[self.path[1:]] = self.rfile.read(int(self.headers["Content-Length"]))
+        self.send_response(204)
+        self.end_headers()
+        if self.path == "/done":
+            self.done.set()
+
+    def log_message(self, *_):
+        pass
+
+
+def in_browser(folder: Path, browser: str) -> dict[str, bytes]:
+    posted, done = {}, threading.Event()
+    handler = partial(Server, directory=folder, posted=posted, done=done)
+    with http.server.ThreadingHTTPServer(("localhost", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://localhost:{server.server_port}/test.html"
+        # A port for debugging keeps the headless shell open after the page has loaded.
+        options = ["--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0"]
+        command = [browser, *options, f"--user-data-dir={folder}/profile", url]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            assert done.wait(240), f"the page sent {list(posted)} and no more"
+        finally:
+            process.kill()
+            process.wait()
+            server.shutdown()
+    return posted
+
+
+@pytest.mark.slow
+def test_pictures_in_a_browser_are_those_of_python(tmp_path, capsys):
+    pytest.importorskip("onnx")
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    runtime = os.environ.get("FIRENET_ONNXRUNTIME_WEB")
+    if browser is None or runtime is None:
+        pytest.skip(
+            f"needs one of {BROWSERS}, and FIRENET_ONNXRUNTIME_WEB, onnxruntime-web's folder"
+        )
+    page, text = tmp_path / "page", tmp_path / "a.txt"
+    write_recording(text, 6000, width=52, height=40)
+    run(Export(web=page, runtime=Path(runtime), sample=text))
+
+    rows = np.loadtxt(text, skiprows=1)
+    shutil.copy(text, page)
+    (page / "a.txt.gz").write_bytes(gzip.compress(text.read_bytes()))
+    with zipfile.ZipFile(page / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.write(text, "folder/events.txt")
+    times = np.rint(1e6 * rows[:, 0]).astype(np.int64)
+    np.savez_compressed(page / "a.npz", t=times, x=rows[:, 1], y=rows[:, 2], p=rows[:, 3])
+    np.save(page / "a.npy", rows)
+    names = ["a.txt", "a.txt.gz", "a.zip", "a.npz", "a.npy"]
+    bad = {
+        "cut.zip": (page / "a.zip").read_bytes()[:5000], "empty.txt": b"40 30\n",
+        "words.csv": b"0.1 2 3 x\n", "back.txt": b"0.2 1 1 1\n0.1 1 1 1\n", "a.raw": b"1",
+    }  # fmt: skip
+    for name, content in bad.items():
+        (page / name).write_bytes(content)
+    script = TEST_PAGE.replace("NAMES", json.dumps(names)).replace("BAD", json.dumps(list(bad)))
+    (page / "test.html").write_text(script)
+    posted = in_browser(page, browser)
+    assert "failed" not in posted, posted["failed"].decode()
+
+    assert firenet(capsys, f"reconstruct {text} -o {tmp_path / 'out'}")[0] == 0
+    expected = []
+    for path in sorted((tmp_path / "out").glob("*.png")):
+        with Image.open(path) as picture:
+            expected.append(np.asarray(picture))
+    assert len(expected) > 10 and np.ptp(expected) > 100
+    for name in names:
+        found = np.frombuffer(posted[name], np.uint8).reshape(np.shape(expected))
+        differences = np.abs(found.astype(int) - expected)
+        assert differences.max() <= 1 and (differences > 0).mean() < 1e-2, name
+    for name in bad:
+        assert posted[name].decode().startswith(name), posted[name]
+    assert "52x40, 6000 events, picture" in posted["page"].decode()
+
+
+def test_a_page_without_its_runtime_says_what_to_install(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, _, error = firenet(capsys, "export --web page")
+    assert code == 1 and "npm install onnxruntime-web" in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+    runtime = tmp_path / "node_modules" / "onnxruntime-web"
+    runtime.mkdir(parents=True)
+    (runtime / "package.json").write_text('{"version": "1.2.3"}')
+    code, _, error = firenet(capsys, "export --web page")
+    assert code == 1 and f"1.2.3, which lacks {FILES[0]}" in error
+
+
+def test_a_page_holds_all_that_it_asks_for(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("onnx")
+    monkeypatch.chdir(tmp_path)
+    runtime = tmp_path / "node_modules" / "onnxruntime-web"
+    (runtime / "dist").mkdir(parents=True)
+    (runtime / "package.json").write_text('{"version": "1.30.0"}')
+    for name in FILES:
+        (runtime / "dist" / name).write_text("")
+    write_recording(tmp_path / "a.txt", 900)
+    code, said, error = firenet(capsys, "export --web page --sample a.txt")
+    assert code == 0 and "a sample of 900 events" in said, error
+    for script in ("page.js", "network.js", "events.js", "index.html"):
+        assert (tmp_path / "page" / script).stat().st_size > 100
+    with np.load(tmp_path / "page" / "sample.npz") as sample:
+        assert len(sample["t"]) == 900 and (sample["width"], sample["height"]) == (24, 20)
+    assert firenet(capsys, "export --web page --sample a.txt")[0] == 1
+    assert firenet(capsys, "export --web page --sample a.txt --overwrite")[0] == 0
+
+
+@pytest.mark.slow
+def test_a_sample_is_simulated():
+    events = list(simulated(32, 48, seconds=0.1))
+    assert sum(len(chunk) for chunk in events) > 100
+    assert all((chunk.x < 48).all() and (chunk.y < 32).all() for chunk in events)
