@@ -31,6 +31,7 @@ from firenet_jax.readers import (
     to_events,
     to_frame,
 )
+from firenet_jax.storage.files import check_readable
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 COLUMNS = {"event_cnn_minimal": ("ts", "xs", "ys", "ps"), "DSEC": ("t", "x", "y", "p")}
@@ -67,6 +68,7 @@ def read(path: Path) -> Source:
 def opened(path: Path) -> Iterator[h5py.File]:
     """Whatever goes wrong with the file raises RecordingError: damaged bytes, and groups or text
     where numbers are expected, raise every kind."""
+    check_readable(path, RecordingError)
     with reading(path, Exception), h5py.File(path, "r") as file:
         yield file
 
