@@ -23,6 +23,7 @@ from firenet_jax import cli
 from firenet_jax.checkpoint import save_weights
 from firenet_jax.commands import info, options, reconstruct
 from firenet_jax.network import Weights, initial_params
+from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import Network
 from firenet_jax.windows import Windows
 
@@ -68,9 +69,9 @@ def help_of(capsys, monkeypatch, command, width):
 @pytest.mark.parametrize("command", cli.COMMANDS)
 def test_help_breaks_no_line_and_speaks_no_python(capsys, monkeypatch, command):
     narrow, wide = (help_of(capsys, monkeypatch, command, width) for width in (80, 3000))
-    _, boxes, options = narrow.partition("╭")
+    _, _, options = narrow.partition("--help")
     # An empty line is one between paragraphs of what stands above a box's rule.
-    assert not re.search(r"│ +│\n│ +-", boxes + options)
+    assert not re.search(r"^[│| ]+\n[│| ]+-", options, re.M)
     for word in ("None", "Raises", "True", "False", "__", "`threshold", "{", "Error"):
         allowed = word == "{" and re.findall(r"{[a-z0-9,]+}", options)
         assert word not in options or allowed, word
@@ -84,7 +85,7 @@ def test_help_breaks_no_line_and_speaks_no_python(capsys, monkeypatch, command):
 
 
 def test_help_follows_the_order_of_the_settings(capsys, monkeypatch):
-    _, _, text = help_of(capsys, monkeypatch, "reconstruct", 100).partition("╭")
+    _, _, text = help_of(capsys, monkeypatch, "reconstruct", 100).partition("RECORDING... ")
     places = [text.index(f" {option} ") for option in ("--weights", "--events", "--duration",
               "--unsharp", "--preview", "--speed", "--chunk", "--process")]  # fmt: skip
     assert places == sorted(places)
@@ -302,6 +303,18 @@ def test_colours_of_a_sensor_that_says_it_is_grey(here, capsys):
     (here / "a.dat").write_bytes(b"% Version 2\n% Width 24\n% Height 20\n\x00\x08" + words)
     code, _, error = firenet(capsys, "reconstruct a.dat -o out -c weights.npz --color")
     assert code == 1 and "sees no colours" in error and not list(here.glob("out*"))
+    (here / "a.bin").write_bytes(bytes([1, 2, 0x80, 0, 10]))
+    assert open_recording(here / "a.bin").grey and not open_recording(here / "a.txt").grey
+
+
+def test_which_recordings_say_that_their_sensor_is_grey(recordings):
+    """Of cameras' own files all but the DAVIS with a mosaic would; a text never does."""
+    for name, grey in (
+        ("dvxplorer_face.aedat4", True), ("davis346_frames.aedat4", True), ("ncars.dat", True),
+        ("evt2_sparklers.raw", True), ("ncaltech101_faces_easy_0001.bin", True),
+        ("ros1_event_camera_msgs.bag", True), ("ros2_mcap", True), ("ecd_slider_depth", False),
+    ):  # fmt: skip
+        assert open_recording(recordings / name).grey == grey, name
 
 
 def test_what_may_not_be_read_is_named(here, capsys, monkeypatch):
@@ -312,7 +325,8 @@ def test_what_may_not_be_read_is_named(here, capsys, monkeypatch):
     (here / "ecd").mkdir()
     (here / "ecd" / "events.txt").write_text("0.1 3 4 1\n")
     (here / "set").mkdir()
-    (here / "set" / "whole.h5").write_bytes((here / "whole.h5").read_bytes())
+    for name in ("other.h5", "whole.h5"):
+        (here / "set" / name).write_bytes((here / "whole.h5").read_bytes())
     really = open
 
     def refusing(path, *others, **more):

@@ -1,4 +1,4 @@
-"""Arguments of a command line -> its settings, a dataclass whose fields are the options.
+"""Arguments of a command line -> its settings, a dataclass whose fields are the options; and back.
 
 tyro reads the arguments and writes the help. By itself it puts the options of settings within
 settings last and breaks sentences where the source does; so it gets a copy of the dataclass,
@@ -6,6 +6,7 @@ in the order of its fields, with the text below each field as one line and plain
 """
 
 import dataclasses
+import shlex
 import types
 import typing
 from pathlib import Path
@@ -15,6 +16,7 @@ import docstring_parser
 import tyro
 
 WORDS = {Path: "PATH", str: "TEXT", int: "NUMBER", float: "NUMBER", ...: "..."}
+POSITIONAL = typing.get_args(tyro.conf.Positional[int])[1]
 FURTHER = "further"  # options whose fields come after settings within the settings
 
 
@@ -94,3 +96,28 @@ def _original(settings: type, read: Any) -> Any:
     hints = typing.get_type_hints(settings)
     inner = {name for name in values if dataclasses.is_dataclass(hints[name])}
     return settings(**{k: _original(hints[k], v) if k in inner else v for k, v in values.items()})
+
+
+def command_line(command: str, settings: Any) -> str:
+    """What to type for these settings; options that have their default are left out."""
+    return shlex.join(["firenet", command, *_words(settings, None)])
+
+
+def _words(settings: Any, default: Any) -> list[str]:
+    hints = typing.get_type_hints(type(settings), include_extras=True)
+    first, rest = [], []
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        usual = field.default if default is None else getattr(default, field.name)
+        option = field.name.replace("_", "-")
+        if dataclasses.is_dataclass(value):
+            rest += _words(value, usual)
+        elif POSITIONAL in typing.get_args(hints[field.name]):
+            first += map(str, value if isinstance(value, tuple) else [value])
+        elif value == usual:
+            continue
+        elif isinstance(value, bool):
+            rest.append(f"--{option}" if value else f"--no-{option}")
+        else:
+            rest += [f"--{option}", *map(str, value if isinstance(value, tuple) else [value])]
+    return [*first, *rest]

@@ -61,7 +61,8 @@ def read(path: Path) -> Source:
             size = int(match[2]), int(match[1])
     if size is None and frames is not None:
         size = frames.read(0).shape
-    return Source(f"HDF5 ({layout})", lambda: _events(path, layout), size, count, frames)
+    grey = layout == "Metavision"  # Prophesee's, of which none sees colours
+    return Source(f"HDF5 ({layout})", lambda: _events(path, layout), size, count, frames, grey)
 
 
 @contextmanager
