@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firenet_jax.network import BINS, CHANNELS, Weights
+from firenet_jax.storage.files import check_readable
 from firenet_jax.storage.pytorch_file import (
     CheckpointError,
     identify,
@@ -93,6 +94,7 @@ def load_weights(path: str | Path | None = None) -> Weights:
         path = path / "weights.npz"  # a training run keeps its best weights here
     if not path.is_file():
         raise CheckpointError(f"{path} does not exist or is not a file; {TRY}")
+    check_readable(path, CheckpointError)
     if path.suffix in PYTORCH:
         return convert(path)
     if path.suffix == ".npz":

@@ -121,7 +121,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"firenet: no command {arguments[0]!r}\n\n{usage()}", file=sys.stderr)
         return 2
 
-    import tyro
+    from firenet_jax.commands import options
+    from firenet_jax.storage.files import forbidden
 
     logging.basicConfig(format="firenet: %(message)s", level=logging.WARNING)
     _return_freed_memory()
@@ -136,14 +137,8 @@ def main(arguments: list[str] | None = None) -> int:
             return 2
     try:
         command = importlib.import_module(module)
-        parsed = tyro.cli(
-            getattr(command, settings),
-            prog=f"firenet {name}",
-            description=inspect.getdoc(getattr(command, settings)),
-            args=rest,
-            config=(tyro.conf.OmitArgPrefixes,),
-        )
-        command.run(parsed)
+        kind = getattr(command, settings)
+        command.run(options.parse(kind, rest, f"firenet {name}", inspect.getdoc(kind)))
     except KeyboardInterrupt as error:
         goes_on = str(error) or "a folder of pictures or sequences goes on when run again"
         print(f"firenet: interrupted; {goes_on}", file=sys.stderr)
@@ -154,6 +149,8 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         if no_room:
             error = "not enough memory: ask for a smaller sensor, chunk, crop or batch"
+        elif isinstance(error, PermissionError) and error.filename:
+            error = forbidden(error.filename)
         print(f"firenet: error: {error}", file=sys.stderr)
         return 1
     return 0

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from firenet_jax.events import LATEST, Events, Recording, RecordingError, until_damage
+from firenet_jax.storage.files import check_readable
 
 
 def check_span(start: float | None, stop: float | None) -> None:
@@ -90,6 +91,7 @@ def read_hot_pixels(path: str | Path, height: int, width: int) -> np.ndarray:
     """
     path = Path(path)
     hot = np.zeros((height, width), bool)
+    check_readable(path, RecordingError)
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:

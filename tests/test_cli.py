@@ -1,11 +1,16 @@
 """What a user meets: exit codes, and one sentence for everything that is wrong."""
 
+import ast
+import errno
+import importlib
+import itertools
 import json
 import os
 import pickle
 import re
 import subprocess
 import sys
+from pathlib import Path
 from unittest.mock import Mock
 
 import h5py
@@ -17,8 +22,11 @@ from test_pipeline import write_recording
 
 from firenet_jax import cli
 from firenet_jax.checkpoint import save_weights
-from firenet_jax.commands import info
+from firenet_jax.commands import info, options, reconstruct
 from firenet_jax.network import Weights, initial_params
+from firenet_jax.readers import open_recording
+from firenet_jax.reconstruction import Network
+from firenet_jax.windows import Windows
 
 
 @pytest.fixture
@@ -50,6 +58,45 @@ def test_help_and_version(capsys):
         assert stop.value.code == 0
         _, _, examples = capsys.readouterr().out.partition("Examples:")
         assert f"firenet {command} " in examples
+
+
+def help_of(capsys, monkeypatch, command, width):
+    monkeypatch.setenv("COLUMNS", str(width))
+    with pytest.raises(SystemExit):
+        cli.main([command, "--help"])
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_help_breaks_no_line_and_speaks_no_python(capsys, monkeypatch, command):
+    narrow, wide = (help_of(capsys, monkeypatch, command, width) for width in (80, 3000))
+    _, _, options = narrow.partition("--help")
+    # An empty line is one between paragraphs of what stands above a box's rule.
+    assert not re.search(r"^[│| ]+\n[│| ]+-", options, re.M)
+    for word in ("None", "Raises", "True", "False", "__", "`threshold", "{", "Error"):
+        allowed = word == "{" and re.findall(r"{[a-z0-9,]+}", options)
+        assert word not in options or allowed, word
+    # Where there is room, each text is one line.
+    module, kind, _ = cli.COMMANDS[command]
+    settings = ast.parse(Path(importlib.import_module(module).__file__).read_text()).body
+    body = next(node for node in settings if getattr(node, "name", "") == kind).body
+    pairs = [(a, b) for a, b in itertools.pairwise(body) if isinstance(a, ast.AnnAssign)]
+    texts = [" ".join(b.value.value.split()) for _, b in pairs if isinstance(b, ast.Expr)]
+    assert len(texts) > 1 and all(text in wide for text in texts)
+
+
+def test_help_follows_the_order_of_the_settings(capsys, monkeypatch):
+    _, _, text = help_of(capsys, monkeypatch, "reconstruct", 100).partition("RECORDING... ")
+    places = [text.index(f" {option} ") for option in ("--weights", "--events", "--duration",
+              "--unsharp", "--preview", "--speed", "--chunk", "--process")]  # fmt: skip
+    assert places == sorted(places)
+    settings = options.parse(
+        reconstruct.Reconstruct, "a b -o out -T 5 --pad 4 --no-recurrent --batch 2".split(), "", ""
+    )
+    assert settings == reconstruct.Reconstruct(
+        (Path("a"), Path("b")), Path("out"), windows=Windows(duration=5),
+        network=Network(recurrent=False, pad=4), batch=2,
+    )  # fmt: skip
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only glibc has this setting")
@@ -253,3 +300,48 @@ def test_colours_of_a_sensor_that_says_it_is_grey(here, capsys):
     (here / "a.dat").write_bytes(b"% Version 2\n% Width 24\n% Height 20\n\x00\x08" + words)
     code, _, error = firenet(capsys, "reconstruct a.dat -o out -c weights.npz --color")
     assert code == 1 and "sees no colours" in error and not list(here.glob("out*"))
+    (here / "a.bin").write_bytes(bytes([1, 2, 0x80, 0, 10]))
+    assert open_recording(here / "a.bin").grey and not open_recording(here / "a.txt").grey
+
+
+def test_which_recordings_say_that_their_sensor_is_grey(recordings):
+    """Of cameras' own files all but the DAVIS with a mosaic would; a text never does."""
+    for name, grey in (
+        ("dvxplorer_face.aedat4", True), ("davis346_frames.aedat4", True), ("ncars.dat", True),
+        ("evt2_sparklers.raw", True), ("ncaltech101_faces_easy_0001.bin", True),
+        ("ros1_event_camera_msgs.bag", True), ("ros2_mcap", True), ("ecd_slider_depth", False),
+    ):  # fmt: skip
+        assert open_recording(recordings / name).grey == grey, name
+
+
+def test_what_may_not_be_read_is_named(here, capsys, monkeypatch):
+    """Whatever library reads it. Tests may run as root, whom no file refuses, so opening does."""
+    for name in ("hot.txt", "model.pth", "clip.mp4"):
+        (here / name).write_bytes(b"1,1\n")
+    make_bad_inputs(here)  # whole.h5 among them
+    (here / "ecd").mkdir()
+    (here / "ecd" / "events.txt").write_text("0.1 3 4 1\n")
+    (here / "set").mkdir()
+    for name in ("other.h5", "whole.h5"):
+        (here / "set" / name).write_bytes((here / "whole.h5").read_bytes())
+    really = open
+
+    def refusing(path, *others, **more):
+        if not isinstance(path, int) and os.path.basename(path) == closed:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return really(path, *others, **more)
+
+    monkeypatch.setattr("builtins.open", refusing)
+    for closed, line in (
+        ("a.txt", "info a.txt"), ("whole.h5", "info whole.h5"), ("events.txt", "info ecd"),
+        ("hot.txt", f"{RUN} --hot-pixels hot.txt"), ("weights.npz", RUN),
+        ("model.pth", "convert model.pth -o new.npz"), ("whole.h5", "train -o run --data set"),
+        ("clip.mp4", "simulate -o new.h5 --video clip.mp4"),
+    ):  # fmt: skip
+        code, _, error = firenet(capsys, line)
+        assert code == 1 and len(error.splitlines()) == 1, (line, error)
+        assert f"{closed}: permission denied: give yourself the right" in error, (line, error)
+    monkeypatch.setattr(
+        info, "run", Mock(side_effect=PermissionError(13, "Permission denied", "x"))
+    )
+    assert "error: x: permission denied: give" in firenet(capsys, "info a.txt")[2]

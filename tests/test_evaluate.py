@@ -2,7 +2,10 @@
 
 import csv
 import json
+import re
+import shlex
 from html.parser import HTMLParser
+from pathlib import Path
 
 import h5py
 import jax
@@ -12,7 +15,7 @@ from skimage.metrics import structural_similarity
 
 from firenet_jax import cli
 from firenet_jax.checkpoint import save_weights
-from firenet_jax.commands import evaluate
+from firenet_jax.commands import evaluate, options
 from firenet_jax.commands.evaluate import Evaluate, interval, plan, read_flow, run
 from firenet_jax.commands.simulate import Picture, write_sequence
 from firenet_jax.evaluation import comparison, methods, metrics
@@ -189,8 +192,40 @@ def test_the_page_is_well_formed_and_needs_nothing_else(evaluated):
     assert all(link.startswith(("data:", "#")) for link in page.links)
     assert "script" not in page.seen and "link" not in page.seen and "url(" not in text
     assert page.seen.count("video") == 2 and page.seen.count("svg") == 4 + 3
-    assert page.seen.count("img") == 2 * 3 * 5  # sequences, times, a frame and four methods
+    assert page.seen.count("img") == 2 * 3 * 6  # sequences, times, events, a frame, four methods
+    command = re.search("<code>(.*?)</code>", text)[1]
+    assert command == evaluated[1]["command"] and command.startswith("firenet evaluate ")
     assert "histogram equalisation before metrics: none" in text and "data range 1" in text
+
+
+def test_the_pages_events_are_those_before_its_frames(folder, evaluated):
+    chosen = settings(folder, evaluated[0])
+    recording = open_recording(folder / "data" / "a.h5")
+    shown = evaluate.show(
+        chosen, plan("data-a", recording, chosen), [("data-a", name) for name in NAMES]
+    )
+    assert shown.titles == ["events", "frame", *NAMES] and len(shown.stills) == 3
+    (events,) = recording.events()
+    for time, images in shown.stills:
+        end = round(1e6 * float(time.removesuffix(" s")))
+        votes = np.zeros((HEIGHT, WIDTH), int)
+        for t, x, y, p in zip(events.t, events.x, events.y, events.p, strict=True):
+            if end - PERIOD <= t < end:
+                votes[y, x] += 1 if p else -1
+        colours = {1: (0, 0, 255), 0: (255, 255, 255), -1: (255, 0, 0)}
+        expected = [[colours[int(np.sign(vote))] for vote in row] for row in votes]
+        np.testing.assert_array_equal(images[0], expected)
+
+
+def test_the_command_line_gives_the_settings_again():
+    for chosen in (
+        Evaluate((Path("a b"), Path("c")), Path("out")),
+        Evaluate((Path("a"),), Path("out"), "hf,mr", (Path("x"), Path("y")), duration=20.5,
+                 e2vid_sigmoid=False, equalise="local", overwrite=True),
+    ):  # fmt: skip
+        words = shlex.split(options.command_line("evaluate", chosen))
+        assert words[:2] == ["firenet", "evaluate"]
+        assert options.parse(Evaluate, words[2:], "", "") == chosen
 
 
 def test_the_command_prints_the_table_and_goes_on(folder, evaluated, capsys):

@@ -30,7 +30,7 @@ SMALL = {
     "figure6_limitations": "--seconds 0.2 --sequences 1",
     "file_to_pictures": "--events 60000 --runs 1",
     "memory": "--hdf5 20000 --text 20000 --runs 1",
-    "readme_picture": f"{WEIGHTS} {{recording}}",
+    "readme_video": f"{WEIGHTS} {{recording}}",
     "scaling": "--quick",
     "shipped_weights": f"{WEIGHTS} {{recording}} --skip-simulated",
     "simulator_speed": "--runs 1 --lists 1",

@@ -30,6 +30,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+from firenet_jax.commands import options
 from firenet_jax.evaluation import lpips, report
 from firenet_jax.evaluation.comparison import (
     BATCH,
@@ -577,6 +578,7 @@ def protocol(settings: Evaluate) -> list[str]:
 def write_all(settings: Evaluate, results: dict, plans: dict[str, Plan], done: list) -> None:
     """Prints the table; writes results.json, table.csv, the videos and index.html."""
     folder = settings.output
+    results["command"] = options.command_line("evaluate", settings)
     write_text(folder / "results.json", json.dumps(results, indent=1, allow_nan=False))
     write_text(folder / "table.csv", report.spreadsheet(results))
     shown = {name: show(settings, plan, done) for name, plan in plans.items()}
@@ -586,7 +588,7 @@ def write_all(settings: Evaluate, results: dict, plans: dict[str, Plan], done: l
 
 
 def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
-    """The pictures of a sequence side by side, the frames first, and its video on disk.
+    """The pictures of a sequence side by side, events and frames first, and its video on disk.
 
     Only of what is done: what became a gap may have pictures of other settings on disk.
     """
@@ -595,6 +597,10 @@ def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
         for name, method in done
         if name == plan.name
     }
+    names = [f"{kind}_frames" for kind in ("stills", "clip")]
+    events = events_before(
+        plan, settings, {number for f in kept.values() for n in names for number in f[n].tolist()}
+    )
     truths: dict[int, np.ndarray] = {}
 
     def truth(number: int) -> np.ndarray:
@@ -604,12 +610,12 @@ def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
         return truths[number]
 
     def side_by_side(kind: str) -> Iterator[tuple[int, list[np.ndarray]]]:
-        """Frames that every method has: (number, [frame, method, method ...])."""
+        """Frames that every method has: (number, [events, frame, method, method ...])."""
         sets = [set(found[f"{kind}_frames"].tolist()) for found in kept.values()]
         for number in sorted(set.intersection(*sets)) if sets else []:
             places = [found[f"{kind}_frames"].tolist().index(number) for found in kept.values()]
             images = [f[kind][p] for f, p in zip(kept.values(), places, strict=True)]
-            yield number, [truth(number), *images]
+            yield number, [events[number], truth(number), *images]
 
     times = plan.recording.frames.times
     stills = [
@@ -623,7 +629,25 @@ def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
         path.parent.mkdir(exist_ok=True)
         step = np.median(np.diff([int(times[number]) for number, _ in clip])) / 1e6
         coarser = -(-len(clip[0][1]) * plan.recording.width // WIDEST)
-        rows = (np.concatenate(images, 1)[::coarser, ::coarser] for _, images in clip)
+        rows = (
+            np.concatenate([report.in_colours(image) for image in images], 1)[::coarser, ::coarser]
+            for _, images in clip
+        )
         write_video(path, rows, float(np.clip(1 / max(step, 1e-3), 1, 60)))
         video = path.read_bytes()
-    return report.Shown(["frame", *kept], stills, video)
+    return report.Shown(["events", "frame", *kept], stills, video)
+
+
+def events_before(plan: Plan, settings: Evaluate, numbers: set[int]) -> dict[int, np.ndarray]:
+    """(H, W, 3) uint8 for each of these frames: the events of the window that ends there.
+
+    Drawn anew from the recording, and not kept with each method: it is as long as one of them."""
+    recording, found, left = plan.recording, {}, set(numbers)
+    windows = ((window.time, window.events) for window in windows_of(plan, settings))
+    for place, events in matched(windows, plan.times, round(1000 * settings.tolerance)):
+        if not left:
+            break
+        if (number := int(plan.numbers[place])) in left:
+            found[number] = report.event_picture(events, recording.height, recording.width)
+            left.remove(number)
+    return found

@@ -51,6 +51,7 @@ from firenet_jax.storage.files import (
 )
 from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import Bytes, bar
+from firenet_jax.storage.screen import Screen, check_screen
 from firenet_jax.storage.video import (
     OTHER_FILES,
     VIDEOS,
@@ -68,7 +69,7 @@ from firenet_jax.windows import LONGEST, Window, Windows, cut, in_words, usual
 # Settings that the pictures do not depend on (on the chunk only in float32's last bits), or that
 # are told in another way.
 ELSEWHERE = ("recordings", "output", "weights", "fps", "speed", "chunk", "batch", "overwrite")
-ELSEWHERE += ("columns", "strict", "processes", "process")
+ELSEWHERE += ("columns", "strict", "processes", "process", "show")
 RESUME_EVERY = 5.0  # seconds between two saves of what a resumed run needs
 
 
@@ -94,10 +95,13 @@ class Reconstruct:
     """Weights: .npz, a published PyTorch checkpoint, or the folder of a training run. Without:
     those that come with the package."""
     windows: Windows = Windows()
-    network: Network = Network()
     display: Display = Display()
+    network: Network = Network()
     preview: bool = False
     """Show the events (blue: brighter, red: darker) beside the reconstruction."""
+    show: bool = False
+    """Show the pictures in a window, too, while they are made; with several recordings those of the
+    first that is not done."""
     hot_pixels: str | None = None
     """Ignore these pixels: a file of `x,y` lines, or `auto` to find them in the recording."""
     flip: bool = False
@@ -211,6 +215,8 @@ def run(settings: Reconstruct) -> list[Path]:
 
     Raises RecordingError, CheckpointError, OutputError or ValueError, in one sentence."""
     weights = load_weights(settings.weights)
+    if settings.show:
+        check_screen()
     # Recordings have nothing to do with each other, so processes need not know of each other:
     # as one of JAX's own processes, one that is done or dies would take the others with it.
     mine = slice(settings.process or 0, None, settings.processes or 1)
@@ -433,6 +439,7 @@ def reconstruct_jobs(
         return chunk, jax.device_get(shown)
 
     pictures_done: dict[Path, int] = {}
+    screen = Screen() if settings.show else None
     finished = ahead(device(), depth=1)
     try:
         for chunk, shown in finished:
@@ -440,6 +447,8 @@ def reconstruct_jobs(
                 running, times = part.running, part.times
                 for picture, time_of in zip(shown[:, slot], times, strict=False):
                     running.writer.write(picture, time_of)
+                    if screen and slot == min(chunk.parts):
+                        screen.show(picture, str(running.job.output))
                 output = running.job.output
                 pictures_done[output] = pictures_done.get(output, 0) + len(times)
                 if part.ends and running.error:
@@ -464,6 +473,8 @@ def reconstruct_jobs(
             progress.update(read.read() - progress.n if read.total else chunk.count)
     finally:
         finished.close()
+        if screen:
+            screen.close()
         chunks.close()  # else its thread would live as long as an exception that holds this frame
         for writer in writers.values():
             writer.abandon()

@@ -55,6 +55,7 @@ from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage.files import (
     OutputError,
     alone_in,
+    check_readable,
     differences,
     partial_name,
     write_text,
@@ -76,8 +77,7 @@ OF_SCENES = ("sequences", "validation", "seconds", "fps", "images", "scene")  # 
 
 @dataclass(frozen=True)
 class Simulate:
-    """Make training data: random scenes before a simulated event camera, or a video turned into
-    events, as HDF5 files with events, pictures and optical flow.
+    """Make HDF5 files with events, pictures and optical flow: of random scenes, or of a video.
 
     Examples:
       firenet simulate -o data/                                   (the paper's set: 950 and 50)
@@ -578,6 +578,7 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
     Raises ValueError for what cannot be read, or whose times stand still or leave gaps.
     """
     first = last = None
+    check_readable(path)
     try:
         with av.open(str(path), metadata_errors="replace") as container:
             if not container.streams.video or container.format.name == "tty":  # any text is

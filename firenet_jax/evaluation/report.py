@@ -18,6 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
+from firenet_jax.events import Events
+
 
 class Metric(NamedTuple):
     title: str
@@ -47,9 +49,23 @@ QUALITY = 88  # of JPEG: grain of a reconstruction stays visible, at a third of 
 class Shown(NamedTuple):
     """What the page shows of a sequence besides numbers."""
 
-    titles: list[str]  # of the pictures in a row: "frame", then methods
-    stills: list[tuple[str, list[np.ndarray]]]  # (time, [(H, W) uint8 for each title])
+    titles: list[str]  # of the pictures in a row: "events", "frame", then methods
+    stills: list[tuple[str, list[np.ndarray]]]  # (time, [(H, W) or (H, W, 3) uint8 for each title])
     video: bytes | None  # mp4, the same pictures side by side
+
+
+def event_picture(events: Events, height: int, width: int) -> np.ndarray:
+    """(H, W, 3) uint8, on white: blue where most of a pixel's events say brighter, red darker."""
+    places = events.y.astype(np.int64) * width + events.x
+    votes = np.bincount(places, np.where(events.p, 1.0, -1.0), height * width)
+    picture = np.full((height * width, 3), 255, np.uint8)
+    picture[votes > 0], picture[votes < 0] = (0, 0, 255), (255, 0, 0)
+    return picture.reshape(height, width, 3)
+
+
+def in_colours(picture: np.ndarray) -> np.ndarray:
+    """(H, W) or (H, W, 3) -> (H, W, 3)"""
+    return picture if picture.ndim == 3 else np.stack([picture] * 3, -1)
 
 
 # ---- Tables
@@ -154,6 +170,7 @@ h2 { font-size: 19px; margin: 44px 0 4px; padding-top: 14px; border-top: 1px sol
   overflow-wrap: anywhere; }
 p, ul { margin: 4px 0 14px; color: var(--dim); }
 ul { padding-left: 20px; }
+code { font-size: 13px; overflow-wrap: anywhere; }
 nav { margin: 10px 0 0; columns: 5 150px; }
 nav a { display: block; overflow-wrap: anywhere; }
 a { color: #0b5cad; text-decoration: none; }
@@ -194,8 +211,10 @@ def page(results: dict, shown: dict[str, Shown]) -> str:
         f"<style>{STYLE}</style></head><body>",
         "<h1>Reconstructions beside camera frames</h1>",
         f"<p>Sequences: {len(sequences)}. Methods: {escape(', '.join(colours))}. The best number "
-        "of each column is marked. Pictures are shown as they were compared.</p>",
+        "of each column is marked. Pictures are shown as they were compared; events are of the "
+        "window that ends there, blue brighter, red darker.</p>",
         f"<p>{escape(made(results))}</p>",
+        f"<p><code>{escape(results.get('command', ''))}</code></p>",
     ]
     for kind, title in (
         ("over sequences", "Mean over sequences"),

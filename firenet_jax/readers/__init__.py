@@ -36,6 +36,7 @@ from firenet_jax.events import (
     no_triggers,
     until_damage,
 )
+from firenet_jax.storage.files import check_readable, forbidden
 
 # In the order in which they are asked.
 FORMATS = (
@@ -73,8 +74,8 @@ def open_recording(
     A file is read up to where it is damaged, and single rows that cannot be events are left out,
     at most one in a thousand; a notice says what. strict: both raise RecordingError instead.
     columns: their order in a text or array that does not name them, such as "x,y,p,t".
-    Raises RecordingError for a missing, empty, unknown or damaged file, and, when the events get
-    there, for more bad rows than that.
+    Raises RecordingError for a file that is missing, empty, unknown, damaged or not to be read by
+    the user, and, when the events get there, for more bad rows than that.
     """
     path = Path(path)
     if not path.exists():
@@ -83,6 +84,7 @@ def open_recording(
         raise RecordingError(
             f"{path}: is a pipe or device, but a recording is read more than once: make it a file"
         )
+    check_readable(path, RecordingError)
     if path.is_file() and path.stat().st_size == 0:
         raise RecordingError(f"{path}: the file is empty: copy or download it again")
     for name in FORMATS:
@@ -315,6 +317,8 @@ def reading(path: Path, *errors: type[BaseException]):
     except RecordingError:
         raise
     except errors as error:
+        if isinstance(error, PermissionError):
+            raise RecordingError(forbidden(error.filename or path)) from error
         found = " ".join(str(error).split()) or type(error).__name__
         raise RecordingError(
             f"{path}: cannot be read ({found}): the file is damaged, incomplete or of another "

@@ -31,6 +31,7 @@ from firenet_jax.readers import (
     to_events,
     to_frame,
 )
+from firenet_jax.storage.files import check_readable
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 COLUMNS = {"event_cnn_minimal": ("ts", "xs", "ys", "ps"), "DSEC": ("t", "x", "y", "p")}
@@ -60,13 +61,15 @@ def read(path: Path) -> Source:
             size = int(match[2]), int(match[1])
     if size is None and frames is not None:
         size = frames.read(0).shape
-    return Source(f"HDF5 ({layout})", lambda: _events(path, layout), size, count, frames)
+    grey = layout == "Metavision"  # Prophesee's, of which none sees colours
+    return Source(f"HDF5 ({layout})", lambda: _events(path, layout), size, count, frames, grey)
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[h5py.File]:
     """Whatever goes wrong with the file raises RecordingError: damaged bytes, and groups or text
     where numbers are expected, raise every kind."""
+    check_readable(path, RecordingError)
     with reading(path, Exception), h5py.File(path, "r") as file:
         yield file
 

@@ -28,7 +28,7 @@ def matches(path: Path) -> bool:
 
 def read(path: Path) -> Source:
     size = path.stat().st_size
-    return Source("N-Caltech101", lambda: _events(path, size))
+    return Source("N-Caltech101", lambda: _events(path, size), grey=True)  # of an ATIS
 
 
 def _events(path: Path, size: int) -> Iterator[Events | Rows]:

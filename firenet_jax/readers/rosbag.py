@@ -62,7 +62,10 @@ def read(path: Path) -> Source:
     with reading(path, Exception), _bag(path) as bag:
         topics = {entry.topic: entry.msgtype for entry in bag.connections}
         topic = _only(path, [t for t, kind in topics.items() if kind in ARRAYS + PACKETS], topics)
-        size = next((_size(_Message(raw, ros2)) for _, raw in _raw(bag, topic)), None)
+        first = next((raw for _, raw in _raw(bag, topic)), None)
+        size = None if first is None else _size(_Message(first, ros2))
+        packets = first is not None and topics[topic] in PACKETS
+        grey = packets and _packet(_Message(first, ros2)).encoding == "evt3"  # Prophesee's
         images = [t for t, kind in topics.items() if kind == IMAGE]
         # Of several cameras' images, those of the same name: /dvs/events, /dvs/image_raw.
         image_topic = max(images, key=lambda name: len(commonprefix([name, topic])), default=None)
@@ -73,6 +76,7 @@ def read(path: Path) -> Source:
         size,
         frames=frames,
         triggers=lambda: None if topics[topic] in ARRAYS else _triggers(path, topic),
+        grey=grey,
     )
 
 

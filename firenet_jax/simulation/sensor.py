@@ -61,7 +61,7 @@ def _on(fault: float | tuple[float, float] | None) -> bool:
 @dataclass(frozen=True)
 class SensorSettings:
     """The sensor; as it stands the paper's, without faults. Pairs are (least, greatest), drawn
-    log-uniformly for each sequence. A fault is off where it is 0, (0, 0) or None, which is 0 unless
+    log-uniformly for each sequence. A fault is off where it is 0, and where nothing is said, unless
     all faults are asked for.
     """
 
@@ -73,7 +73,7 @@ class SensorSettings:
     threshold_range: tuple[float, float] | None = None
     """Draw the ON threshold log-uniformly from here instead, and OFF about as large."""
     asymmetry: float = 0.1
-    """Standard deviation of OFF in parts of ON, where they are drawn from `threshold_range`: a
+    """Standard deviation of OFF in parts of ON, where they are drawn from the threshold range: a
     pixel that was darker for a while does not count back to where it was."""
     refractory: float | None = None
     """Seconds after an event in which a pixel stays silent; 0.001 where nothing is said."""

@@ -37,6 +37,28 @@ def identity(path: Path) -> list:
     return [path.name, sum(state.st_size for state in states), changed]
 
 
+def check_readable(path: Path, error: type[ValueError] = OutputError) -> None:
+    """Raises `error` where the user may not read a file or list a folder.
+
+    To be asked first: libraries call such a file damaged, or do not name it.
+    """
+    try:
+        if path.is_dir():
+            os.scandir(path).close()
+        elif path.is_file():  # opening a pipe would take from it
+            open(path, "rb").close()
+    except PermissionError as refusal:
+        raise error(forbidden(refusal.filename or path)) from refusal
+
+
+def forbidden(path: str | Path) -> str:
+    """The sentence for it."""
+    return (
+        f"{path}: permission denied: give yourself the right to it (chmod u+rwX), or use a copy or "
+        "place that is yours"
+    )
+
+
 @contextlib.contextmanager
 def writing(path: Path):
     """Full disks and the like, said with the name of the output and of what is in the way."""
@@ -126,6 +148,7 @@ def write_arrays(path: Path, **arrays) -> None:
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """All of an .npz; never unpickles. Raises OutputError for one that is not whole."""
+    check_readable(path)
     try:
         # opened here, as numpy leaves a file that is no archive open
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:

@@ -28,6 +28,8 @@ from pathlib import Path
 
 import numpy as np
 
+from firenet_jax.storage.files import check_readable
+
 MAGIC_NUMBER = 0x1950A86A20F9469CFC6C
 PROTOCOL = 1001
 MAX_ELEMENTS = 2**28  # 100 times the largest network of this field; a stride of 0 can claim any
@@ -46,6 +48,7 @@ def read_state_dict(path: str | Path) -> dict[str, np.ndarray]:
     than data.
     """
     path = Path(path)
+    check_readable(path, CheckpointError)
     try:
         with open(path, "rb") as file:
             start = file.read(16)

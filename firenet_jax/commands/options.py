@@ -1,0 +1,123 @@
+"""Arguments of a command line -> its settings, a dataclass whose fields are the options; and back.
+
+tyro reads the arguments and writes the help. By itself it puts the options of settings within
+settings last and breaks sentences where the source does; so it gets a copy of the dataclass,
+in the order of its fields, with the text below each field as one line and plain words for types.
+"""
+
+import dataclasses
+import shlex
+import types
+import typing
+from pathlib import Path
+from typing import Annotated, Any
+
+import docstring_parser
+import tyro
+
+WORDS = {Path: "PATH", str: "TEXT", int: "NUMBER", float: "NUMBER", ...: "..."}
+POSITIONAL = typing.get_args(tyro.conf.Positional[int])[1]
+FURTHER = "further"  # options whose fields come after settings within the settings
+
+
+def parse(settings: type, arguments: list[str], prog: str, description: str) -> Any:
+    """The settings that the arguments say.
+
+    Ends the program with exit code 2 where tyro cannot read them, and with 0 after the help. Raises
+    what the settings raise.
+    """
+    copy = _copy(settings, None)
+    read = tyro.cli(
+        copy, prog=prog, description=description, args=arguments,
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+    )  # fmt: skip
+    return _original(settings, read)
+
+
+def _copy(settings: type, default: Any, text: str | None = None) -> type:
+    """A dataclass of the same fields for tyro.
+
+    default: settings of this type, whose values are the defaults; None: the fields' own.
+    text: what they are about; None: as their docstring begins.
+    """
+    texts = {
+        entry.arg_name: " ".join((entry.description or "").split())
+        for entry in docstring_parser.parse_from_object(settings).params
+    }
+    hints = typing.get_type_hints(settings, include_extras=True)
+    first, rest, nested = [], [], False
+    for field in dataclasses.fields(settings):
+        value = field.default if default is None else getattr(default, field.name)
+        if dataclasses.is_dataclass(hints[field.name]):
+            inner = _copy(hints[field.name], value, texts.get(field.name))
+            first.append((field.name, inner, dataclasses.field(default_factory=inner)))
+            nested = True
+            continue
+        required = value is dataclasses.MISSING
+        hint = _plain(hints[field.name], texts.get(field.name, ""), required)
+        (rest if nested else first).append((field.name, hint, dataclasses.field(default=value)))
+    if rest:
+        further = _made("Further", rest, "")
+        first.append((FURTHER, further, dataclasses.field(default_factory=further)))
+    text = text or docstring_parser.parse(settings.__doc__).description
+    return _made(settings.__name__, first, text)
+
+
+def _made(name: str, fields: list, text: str | None) -> type:
+    made = dataclasses.make_dataclass(name, fields, kw_only=True, frozen=True)
+    made.__doc__ = text or " "  # empty, dataclass and tyro would write one
+    return made
+
+
+def _plain(hint: Any, text: str, required: bool) -> Any:
+    """The same type, shown as PATH and not as {None}|PATH, its default only where it tells much."""
+    kind, *extras = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
+    said: dict[str, Any] = {"help": text}
+    if not required:  # tyro's place for the default: an empty one after a text can make a line
+        said = {"help_behavior_hint": lambda default: text + _in_words(default)}
+    inner = kind
+    if isinstance(kind, types.UnionType):
+        inner = next(part for part in typing.get_args(kind) if part is not types.NoneType)
+    parts = typing.get_args(inner) if typing.get_origin(inner) is tuple else (inner,)
+    if all(part in WORDS for part in parts):
+        said["metavar"] = " ".join(WORDS[part] for part in parts).replace(" ...", "...")
+    return Annotated[kind, tyro.conf.arg(**said), *extras]
+
+
+def _in_words(default: str) -> str:
+    return "" if default in ("", "None", "False", "True") else f" (default: {default})"
+
+
+def _original(settings: type, read: Any) -> Any:
+    """A copy with its values -> the settings."""
+    values = {field.name: getattr(read, field.name) for field in dataclasses.fields(read)}
+    if FURTHER in values:
+        values |= vars(values.pop(FURTHER))
+    hints = typing.get_type_hints(settings)
+    inner = {name for name in values if dataclasses.is_dataclass(hints[name])}
+    return settings(**{k: _original(hints[k], v) if k in inner else v for k, v in values.items()})
+
+
+def command_line(command: str, settings: Any) -> str:
+    """What to type for these settings; options that have their default are left out."""
+    return shlex.join(["firenet", command, *_words(settings, None)])
+
+
+def _words(settings: Any, default: Any) -> list[str]:
+    hints = typing.get_type_hints(type(settings), include_extras=True)
+    first, rest = [], []
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        usual = field.default if default is None else getattr(default, field.name)
+        option = field.name.replace("_", "-")
+        if dataclasses.is_dataclass(value):
+            rest += _words(value, usual)
+        elif POSITIONAL in typing.get_args(hints[field.name]):
+            first += map(str, value if isinstance(value, tuple) else [value])
+        elif value == usual:
+            continue
+        elif isinstance(value, bool):
+            rest.append(f"--{option}" if value else f"--no-{option}")
+        else:
+            rest += [f"--{option}", *map(str, value if isinstance(value, tuple) else [value])]
+    return [*first, *rest]
