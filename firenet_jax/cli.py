@@ -1,4 +1,4 @@
-"""Command line -> one command: firenet demo | reconstruct | info | train | evaluate and others.
+"""Command line -> one command: firenet demo | reconstruct | live | train | evaluate and others.
 
 A command is a frozen dataclass of settings and a `run(settings)` beside it, in a module that is
 imported only when the command is named: `firenet --help` loads no jax.
@@ -24,6 +24,7 @@ COMMANDS = {
         "Reconstruct",
         "recordings -> video or pictures",
     ),
+    "live": ("firenet_jax.commands.live", "Live", "a camera, a stream -> pictures at once"),
     "info": ("firenet_jax.commands.info", "Info", "what a recording holds"),
     "simulate": (
         "firenet_jax.commands.simulate",

@@ -21,7 +21,7 @@ LAYERS = [
     ["storage", "windows", "network"],
     ["readers", "tensors", "checkpoint", "filters"],
     ["reconstruction", "simulation"],
-    ["evaluation", "export"],
+    ["evaluation", "export", "live"],
     ["training"],
     ["commands"],
     ["cli"],

@@ -1,0 +1,164 @@
+"""Events as they come -> pictures at once, on a page of this machine."""
+
+import itertools
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+from urllib.parse import urlsplit
+
+import tyro
+
+from firenet_jax.checkpoint import load_weights
+from firenet_jax.events import RecordingError, counted, parse_size
+from firenet_jax.live import sources
+from firenet_jax.live.engine import Figures, pictures
+from firenet_jax.live.page import Board, serve
+from firenet_jax.pictures import Display
+from firenet_jax.readers import open_recording
+from firenet_jax.windows import LONGEST, Windows
+
+
+@dataclass(frozen=True)
+class Live:
+    """Watch a camera, a stream of events, or a recording as if it came from a camera.
+
+    Prints the address of a page: the events, the reconstruction, event rate, latency. When more
+    events come than this machine works off, whole windows are dropped and counted.
+
+    Examples:
+      firenet live recording.aedat4 --replay
+      firenet live camera
+      firenet live udp://127.0.0.1:3333 --sensor-size 640x480
+      my_program | firenet live - --sensor-size 240x180 --wire text
+    """
+
+    source: tyro.conf.Positional[str]
+    """camera; udp://HOST:PORT to listen at; tcp://HOST:PORT to connect to; - for standard input; a
+    file that another program writes; or with --replay a recording of any format."""
+    replay: bool = False
+    """Play a recording at its own speed."""
+    speed: float = 1.0
+    """Play it so many times as fast."""
+    repeat: int = 1
+    """Play it so many times."""
+    weights: Annotated[str | None, tyro.conf.arg(aliases=["-c"])] = None
+    """Weights of `firenet train` or a PyTorch checkpoint (default: built-in)."""
+    sensor_size: str | None = None
+    """WIDTHxHEIGHT of the sensor; streams do not say it."""
+    wire: Literal["t64_x16_y16_on8", "t32_x16_y15_on1", "text"] = "t64_x16_y16_on8"
+    """How a stream writes an event: 13 bytes, 8 bytes (both as faery sends them), or a line."""
+    events_per_pixel: float = 0.35
+    """Events of a window, per pixel of the sensor."""
+    longest: float = LONGEST
+    """A window lasts so many milliseconds at most."""
+    behind: int = 2
+    """Windows that may wait; of more the oldest is dropped."""
+    port: int = 8765
+    """Of the page, on 127.0.0.1; 0: any that is free."""
+    seconds: float | None = None
+    """End after so long."""
+    display: Display = Display()
+
+    def __post_init__(self):
+        for name in ("speed", "repeat", "behind", "longest"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}, but must be more than 0")
+        if not 0 <= self.port < 2**16:
+            raise ValueError(f"port is {self.port}, but ports are 0 to 65535")
+        Windows(events_per_pixel=self.events_per_pixel)  # checks it
+
+
+def source_of(settings: Live) -> sources.Source:
+    """Raises RecordingError, or ValueError, in one sentence, for what is no source."""
+    if settings.replay:
+        recording = open_recording(Path(settings.source), parse_size(settings.sensor_size))
+        arrivals = sources.replay(recording, settings.speed, settings.repeat)
+        return sources.Source(recording.path.name, recording.height, recording.width, arrivals)
+    if settings.source == "camera":
+        return sources.camera()
+    if settings.sensor_size is None:
+        raise ValueError(
+            f"{settings.source}: a stream does not say how large the sensor is: pass --sensor-size "
+            "WIDTHxHEIGHT, or --replay where this is a recording"
+        )
+    pieces, datagrams = _pieces(settings.source)
+    arrivals = sources.decoded(pieces, settings.wire, datagrams)
+    return sources.Source(settings.source, *parse_size(settings.sensor_size), arrivals)
+
+
+def _pieces(source: str):
+    if source == "-":
+        return sources.standard_input(), False
+    address = urlsplit(source)
+    if address.scheme in ("udp", "tcp"):
+        try:
+            host, port = address.hostname, address.port
+        except ValueError:
+            port = None
+        if not host or not port:
+            raise ValueError(f"{source}: expected {address.scheme}://HOST:PORT")
+        reach = sources.udp if address.scheme == "udp" else sources.tcp
+        return reach(host, port), address.scheme == "udp"
+    if not Path(source).is_file():
+        raise RecordingError(
+            f"{source}: no such file, and no source: camera, udp://HOST:PORT, tcp://HOST:PORT, - "
+            "(standard input), a file that is being written, or --replay RECORDING"
+        )
+    return sources.growing(Path(source)), False
+
+
+def run(settings: Live) -> None:
+    """Until the source ends, `seconds` are over or Ctrl-C; then says what was seen."""
+    source = source_of(settings)
+    weights = load_weights(settings.weights)
+    figures, board = Figures(), Board()
+    try:
+        server = serve(board, figures.summary, source.name, settings.port)
+    except OSError as error:
+        raise ValueError(
+            f"port {settings.port} is taken ({error}): pass another --port, or --port 0"
+        ) from error
+    address = f"http://127.0.0.1:{server.server_address[1]}/"
+    size = f"{source.width}x{source.height}"
+    print(f"{source.name}, {size}: open {address} to watch, Ctrl-C ends", flush=True)
+    count = Windows(events_per_pixel=settings.events_per_pixel).count(source.height * source.width)
+    begun = time.monotonic()
+    arrivals = source.arrivals
+    if settings.seconds is not None:
+        arrivals = itertools.takewhile(
+            lambda _: time.monotonic() - begun < settings.seconds, arrivals
+        )
+    shown = pictures(
+        arrivals, weights, height=source.height, width=source.width, count=count,
+        longest=round(1000 * settings.longest), figures=figures, behind=settings.behind,
+        settings=settings.display,
+    )  # fmt: skip
+    try:
+        for picture in shown:
+            board.hang(picture)
+            _say(figures)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        shown.close()
+        board.end()
+        server.shutdown()
+        server.server_close()
+    found = figures.summary()
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+    print(
+        f"{counted(found['windows'], 'picture')} of {counted(found['events'], 'event')} in "
+        f"{time.monotonic() - begun:.1f} s, {found['dropped_windows']:,} windows dropped, "
+        f"{found['bad_events']:,} events left out; latency {found['latency_ms']} ms, 95 % below "
+        f"{found['latency_95_ms']} ms"
+    )
+
+
+def _say(figures: Figures) -> None:
+    """On a terminal, a line that is written over."""
+    if sys.stderr.isatty() and figures.shown % 25 == 0:
+        print(f"\r{json.dumps(figures.summary())}", end="", file=sys.stderr, flush=True)

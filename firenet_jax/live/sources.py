@@ -1,0 +1,248 @@
+"""A camera, a stream, a growing file, a recording -> events as they arrive.
+
+A source is an iterator of `Events` that never blocks for long: where nothing comes for a while it
+yields empty ones, so that whoever listens can act on time. Bytes are decoded by a wire format:
+
+    t64_x16_y16_on8   13 bytes an event: t u64 microseconds, x u16, y u16, polarity u8
+    t32_x16_y15_on1   8 bytes: t u32 microseconds (wraps round), x u16, (y << 1 | polarity) u16
+    text              a line: t x y p; t in seconds where it has a decimal point, else microseconds
+
+All little-endian. The binary ones are those that faery sends and receives over UDP, so its
+converters and camera programs can feed this one; text is what everything can write.
+"""
+
+import contextlib
+import select
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from firenet_jax.events import Events, Recording, RecordingError
+
+TICK = 0.005  # seconds between two looks at a source that has nothing
+SLICE = 0.002  # seconds of a replay that arrive together
+PIECE = 2**16  # bytes read at once; no datagram is larger
+BINARY = {
+    "t64_x16_y16_on8": np.dtype([("t", "<u8"), ("x", "<u2"), ("y", "<u2"), ("on", "u1")]),
+    "t32_x16_y15_on1": np.dtype([("t", "<u4"), ("x", "<u2"), ("y_on", "<u2")]),
+}
+WIRES = (*BINARY, "text")
+NOTHING = Events.empty()
+
+
+class Source(NamedTuple):
+    """Where events come from."""
+
+    name: str  # for people
+    height: int
+    width: int
+    arrivals: Iterator[Events]
+
+
+# ---- Recordings, played
+
+
+def replay(
+    recording: Recording,
+    speed: float = 1.0,
+    repeat: int = 1,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Iterator[Events]:
+    """A recording's events when they would have come, `speed` times as fast, `repeat` times.
+
+    Times go on from one round to the next. Where this machine reads more slowly than that, events
+    come as fast as they can be read.
+    """
+    begun, first, shift, last = clock(), None, 0, 0
+    part = max(1, round(1e6 * SLICE * speed))  # microseconds of the recording in a slice
+    for _ in range(repeat):
+        beginning = True
+        for chunk in recording.events():
+            first = int(chunk.t[0]) if first is None else first
+            if beginning and last:
+                shift = last + part - int(chunk.t[0])
+            beginning = False
+            t = chunk.t + shift
+            ends = np.arange(t[0] + part, t[-1] + part, part)
+            stops = np.unique([*np.searchsorted(t, ends), len(t)])
+            start = 0
+            for stop in stops[stops > 0].tolist():
+                due = begun + (int(t[stop - 1]) - first) / 1e6 / speed
+                while (wait := due - clock()) > 0:
+                    sleep(min(wait, TICK))
+                    if wait > TICK:
+                        yield NOTHING
+                yield Events(t[start:stop], *(c[start:stop] for c in (chunk.x, chunk.y, chunk.p)))
+                start = stop
+            last = int(t[-1])
+
+
+# ---- Bytes
+
+
+def udp(host: str, port: int) -> Iterator[bytes]:
+    """Datagrams that come to this address, each of whole events."""
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**22)
+            listening.bind((host, port))
+            listening.settimeout(TICK)
+            while True:
+                try:
+                    yield listening.recv(PIECE)
+                except TimeoutError:
+                    yield b""
+    except OSError as error:
+        raise RecordingError(f"udp://{host}:{port}: cannot listen there ({error})") from error
+
+
+def tcp(host: str, port: int) -> Iterator[bytes]:
+    """What the program that listens at this address sends, until it ends."""
+    try:
+        with socket.create_connection((host, port), timeout=10) as connection:
+            connection.settimeout(TICK)
+            while True:
+                try:
+                    piece = connection.recv(PIECE)
+                except TimeoutError:
+                    yield b""
+                    continue
+                if not piece:
+                    return
+                yield piece
+    except OSError as error:
+        raise RecordingError(
+            f"tcp://{host}:{port}: {error}; start the program that sends events there first"
+        ) from error
+
+
+def standard_input() -> Iterator[bytes]:
+    """What is piped into this program, until its end."""
+    pipe = sys.stdin.buffer
+    if not hasattr(select, "poll"):  # Windows: pipes cannot be asked, so this may wait
+        while piece := pipe.read1(PIECE):
+            yield piece
+        return
+    poll = select.poll()
+    poll.register(pipe.fileno(), select.POLLIN)
+    while True:
+        if not poll.poll(1000 * TICK):
+            yield b""
+            continue
+        piece = pipe.read1(PIECE)
+        if not piece:
+            return
+        yield piece
+
+
+def growing(path: Path) -> Iterator[bytes]:
+    """A file that another program writes: what it holds, then what is added, without end."""
+    with path.open("rb") as file:
+        while True:
+            piece = file.read(PIECE)
+            if not piece:
+                time.sleep(TICK)
+            yield piece
+
+
+# ---- Bytes to events
+
+
+def decoded(pieces: Iterable[bytes], wire: str, datagrams: bool = False) -> Iterator[Events]:
+    """Pieces of a stream, cut anywhere -> Events, an empty one for each piece without any.
+
+    datagrams: each piece is of whole events, and what is left over of one is none.
+    Raises RecordingError for text that is no events.
+    """
+    decode = _text if wire == "text" else _Binary(BINARY[wire])
+    rest = b""
+    for piece in pieces:
+        events, rest = decode(rest + piece) if piece else (NOTHING, rest)
+        rest = b"" if datagrams else rest
+        yield events
+
+
+class _Binary:
+    """Remembers how often a clock of 32 bits has wrapped round."""
+
+    def __init__(self, kind: np.dtype):
+        self.kind, self.turns, self.last = kind, 0, None
+
+    def __call__(self, data: bytes) -> tuple[Events, bytes]:
+        size = self.kind.itemsize
+        whole = len(data) // size * size
+        rows = np.frombuffer(data[:whole], self.kind)
+        if "on" in self.kind.names:
+            # A time that int64 cannot hold is nonsense, and left out as one before all others.
+            t = np.where(rows["t"] < 2**62, rows["t"], 0).astype(np.int64)
+            y, on = rows["y"], rows["on"] != 0
+        else:
+            y, on, t = rows["y_on"] >> 1, rows["y_on"] & 1 == 1, rows["t"].astype(np.int64)
+            if len(t):
+                steps = np.diff(t, prepend=t[0] if self.last is None else self.last)
+                turns = self.turns + np.cumsum(steps < -(2**31)) - np.cumsum(steps > 2**31)
+                self.turns, self.last = int(turns[-1]), int(t[-1])
+                t = t + np.maximum(turns, 0) * 2**32
+        # What int16 cannot hold lies outside of every sensor.
+        x, y = (np.where(column < 2**15, column, -1).astype(np.int16) for column in (rows["x"], y))
+        return Events(t, x, y, on), data[whole:]
+
+
+def _text(data: bytes) -> tuple[Events, bytes]:
+    lines, _, rest = data.rpartition(b"\n")
+    rows = [line.split() for line in lines.splitlines()]
+    rows = [row for row in rows if len(row) not in (0, 2) and not row[0].startswith(b"#")]
+    if not rows:
+        return NOTHING, rest
+    try:
+        seconds = any(b"." in row[0] for row in rows)
+        t, x, y, p = np.array(rows, np.float64).T
+        t = np.rint(1e6 * t if seconds else t)
+        if not (np.abs(t) < 2**53).all() or not (np.abs([x, y]) < 2**15).all():
+            raise ValueError("numbers too large")
+    except ValueError as error:
+        shown = b" ".join(rows[0])[:60].decode(errors="replace")
+        raise RecordingError(
+            f"the stream holds {shown!r} where lines of t x y p were expected ({error}): is "
+            f"--wire right? It may be {', '.join(BINARY)}"
+        ) from error
+    return Events(t.astype(np.int64), x.astype(np.int16), y.astype(np.int16), p > 0), rest
+
+
+# ---- Cameras
+
+
+def camera() -> Source:
+    """The first camera that is plugged in, by neuromorphic_drivers (Prophesee, iniVation)."""
+    try:
+        import neuromorphic_drivers as drivers
+    except ImportError as error:
+        raise RecordingError(
+            "a camera needs its drivers: pip install neuromorphic_drivers, or send its events by "
+            "another program to udp://"
+        ) from error
+    with contextlib.ExitStack() as opened:
+        try:
+            device = opened.enter_context(drivers.open(iterator_timeout=TICK))
+        except Exception as error:  # whatever the driver raises where there is no camera
+            raise RecordingError(
+                f"no camera can be opened ({error}): is one plugged in?"
+            ) from error
+        properties, closing = device.properties(), opened.pop_all()
+
+    def arrivals():
+        with closing:
+            for _, packet in device:
+                rows = None if packet is None else packet.polarity_events
+                if rows is None or not len(rows):
+                    yield NOTHING
+                else:
+                    yield Events.of(rows["t"], rows["x"], rows["y"], rows["on"])
+
+    return Source(str(device.name().value), properties.height, properties.width, arrivals())

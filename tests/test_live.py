@@ -1,0 +1,377 @@
+"""Streams against slow decoding; windows against the rules; pictures against the batch program."""
+
+import contextlib
+import gc
+import http.client
+import io
+import itertools
+import json
+import socket
+import struct
+import threading
+import time
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from firenet_jax import cli
+from firenet_jax.events import Events, Recording, RecordingError, concatenate
+from firenet_jax.live import sources
+from firenet_jax.live.engine import Arrived, Figures, Waiting, pictures, sound, windows
+from firenet_jax.live.page import Board, serve
+from firenet_jax.network import Weights, initial_params
+from firenet_jax.pictures import Display
+from firenet_jax.reconstruction import Network, events_to_pictures, initial_session
+from firenet_jax.tensors import pack
+
+HEIGHT, WIDTH = 12, 20
+
+
+def some_events(count=200, last=50_000, seed=0, start=0):
+    rng = np.random.default_rng(seed)
+    t = start + np.sort(rng.integers(0, last, count))
+    x, y = rng.integers(0, WIDTH, count), rng.integers(0, HEIGHT, count)
+    return Events.of(t, x, y, rng.integers(0, 2, count))
+
+
+def rows(events):
+    return list(zip(*(getattr(events, name).tolist() for name in "txyp"), strict=True))
+
+
+def recording_of(tmp_path, *chunks):
+    return Recording(tmp_path / "r", "test", HEIGHT, WIDTH, lambda: iter(chunks))
+
+
+# ---- Wires
+
+
+def written(events, wire):
+    lines = {
+        "t64_x16_y16_on8": lambda t, x, y, p: struct.pack("<QHHB", t, x, y, p),
+        "t32_x16_y15_on1": lambda t, x, y, p: struct.pack("<IHH", t % 2**32, x, y << 1 | p),
+        "text": lambda t, x, y, p: f"{t} {x} {y} {int(p)}\n".encode(),
+    }
+    return b"".join(lines[wire](*row) for row in rows(events))
+
+
+@pytest.mark.parametrize("wire", sources.WIRES)
+@pytest.mark.parametrize("piece", [1, 7, 64, 10_000])
+def test_a_stream_cut_anywhere(wire, piece):
+    events = some_events(60)
+    data = written(events, wire)
+    pieces = [data[k : k + piece] for k in range(0, len(data), piece)]
+    found = concatenate([*sources.decoded([b"", *pieces, b""], wire)])
+    assert rows(found) == rows(events)
+
+
+def test_a_clock_of_32_bits_wraps_round_and_packets_may_change_places():
+    events = some_events(50, last=2**32, start=2**31)  # reaches beyond the end once
+    halves = events.select(slice(25)), events.select(slice(25, None))
+    pieces = [written(half, "t32_x16_y15_on1") for half in halves]
+    assert rows(concatenate([*sources.decoded(pieces, "t32_x16_y15_on1")])) == rows(events)
+    late = Events.of([2**32 - 5, 2**32 + 5, 2**32 - 3, 2**32 + 6], *np.zeros((3, 4), int))
+    found = [*sources.decoded([written(late, "t32_x16_y15_on1")], "t32_x16_y15_on1")]
+    assert found[0].t.tolist() == late.t.tolist()
+
+
+def test_what_is_left_over_of_a_datagram_is_no_event():
+    events = some_events(6)
+    data = written(events, "t64_x16_y16_on8")
+    found = concatenate([*sources.decoded([data[:20], data[26:]], "t64_x16_y16_on8", True)])
+    assert rows(found) == rows(events)[:1] + rows(events)[2:]
+
+
+def test_text_in_seconds_with_a_header():
+    text = b"20 12\n# t x y p\n0.000001 3 4 1\n\n1.5 5 6 -1\n"
+    found = concatenate([*sources.decoded([text], "text")])
+    assert rows(found) == [(1, 3, 4, True), (1_500_000, 5, 6, False)]
+
+
+@pytest.mark.parametrize("text", [b"GET / HTTP/1.1\n", b"1 2 3 nonsense\n", b"1 99999 3 1\n"])
+def test_text_that_is_no_events_is_refused(text):
+    with pytest.raises(RecordingError, match="lines of t x y p were expected"):
+        list(sources.decoded([text], "text"))
+
+
+@pytest.mark.parametrize("wire", list(sources.BINARY))
+def test_any_bytes_decode_to_something(wire):
+    noise = np.random.default_rng(0).bytes(13 * 800)
+    figures = Figures()
+    for events in sources.decoded([noise], wire):
+        inside = list(sound([events.select(slice(900))], 2**15, 2**15, figures))
+        assert all((e.t >= 0).all() for e in inside)
+
+
+# ---- Sockets and files
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # its socket
+def test_udp_receives_what_faery_sends():
+    faery = pytest.importorskip("faery")
+    encoder = pytest.importorskip("faery.udp_encoder")
+    events = some_events(250)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    columns = {"t": events.t, "x": events.x, "y": events.y, "on": events.p}
+    array = np.zeros(len(events), faery.EVENTS_DTYPE)
+    for name, column in columns.items():
+        array[name] = column
+    pieces = sources.udp("127.0.0.1", port)
+    assert next(pieces) == b""  # nothing yet, and it does not wait for it
+    encoder.encode([array], ("127.0.0.1", port))
+    found = list(itertools.islice((p for p in pieces if p), 3))
+    pieces.close()
+    decoded = concatenate([*sources.decoded(found, "t64_x16_y16_on8", True)])
+    assert rows(decoded) == rows(events)
+    gc.collect()  # faery leaves its socket open: here, not in the next test
+
+
+def test_tcp_reads_until_the_sender_ends():
+    events = some_events(500)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def send():
+            connection, _ = server.accept()
+            with connection:
+                connection.sendall(written(events, "t64_x16_y16_on8"))
+
+        threading.Thread(target=send, daemon=True).start()
+        pieces = sources.tcp("127.0.0.1", server.getsockname()[1])
+        found = concatenate([*sources.decoded(pieces, "t64_x16_y16_on8")])
+    assert rows(found) == rows(events)
+
+
+def test_nobody_there_is_one_sentence():
+    with pytest.raises(RecordingError, match="start the program that sends"):
+        next(sources.tcp("127.0.0.1", 1))
+
+
+def test_a_growing_file(tmp_path):
+    path, events = tmp_path / "events.bin", some_events(100)
+    data = written(events, "t64_x16_y16_on8")
+    path.write_bytes(data[:400])
+    arrivals = sources.decoded(sources.growing(path), "t64_x16_y16_on8")
+    first = [next(arrivals), next(arrivals)]
+    with path.open("ab") as file:
+        file.write(data[400:])
+    assert rows(concatenate([*first, next(arrivals)])) == rows(events)
+
+
+# ---- Replay
+
+
+class Clock:
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.now += seconds
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 20.0])
+def test_replay_gives_events_when_they_would_have_come(tmp_path, speed):
+    chunks = some_events(300, seed=1), some_events(300, start=50_000, seed=2)
+    clock, arrived = Clock(), []
+    for events in sources.replay(
+        recording_of(tmp_path, *chunks), speed, 2, clock=clock, sleep=clock.sleep
+    ):
+        arrived += [(clock.now, *row) for row in rows(events)]
+    whole = rows(concatenate(list(chunks)))
+    assert [row[2:] for row in arrived] == [row[1:] for row in whole * 2]
+    now, t = np.array([row[:2] for row in arrived]).T
+    assert (np.diff(t) >= 0).all() and t[600] > t[599]
+    lateness = (now - 100.0) - (t - t[0]) / 1e6 / speed
+    assert lateness.min() > -1e-9 and lateness.max() < sources.SLICE + 1e-9
+
+
+# ---- Windows
+
+
+def cut(parts, count, longest):
+    """parts: (seconds of the clock, events)"""
+    clock = iter([now for now, _ in parts])
+    found = windows((events for _, events in parts), count, longest, clock=lambda: next(clock))
+    return list(found)
+
+
+def test_windows_of_a_count_and_of_a_time():
+    events = some_events(1000, last=400_000)
+    parts = [(0.01 * k, events.select(slice(37 * k, 37 * k + 37))) for k in range(28)]
+    found = cut(parts, 60, 20_000)
+    assert rows(concatenate([w.events for w in found])) == rows(events)
+    for window, following in itertools.pairwise(found):
+        t = window.events.t
+        full = len(t) == 60 or following.events.t[0] - t[0] >= 20_000
+        assert full and len(t) <= 60 and t[-1] - t[0] < 20_000
+
+
+def test_the_last_events_before_a_pause_do_not_wait_for_its_end():
+    events, nothing = some_events(10, last=1000), Events.empty()
+    parts = [(0.0, events), (0.01, nothing), (0.039, nothing), (0.041, nothing), (9.0, nothing)]
+    found = cut(parts, 60, 40_000)
+    assert [(len(w.events), w.at) for w in found] == [(10, 0.0)]
+
+
+def test_what_cannot_be_is_left_out_and_counted():
+    events = Events.of([5, 6, 4, 7, 8], [0, 20, 1, 2, -1], [0, 0, 0, 12, 3], [1] * 5)
+    figures = Figures()
+    (found,) = sound([events], HEIGHT, WIDTH, figures)
+    assert rows(found) == [(5, 0, 0, True)] and (figures.events, figures.bad) == (5, 4)
+    with pytest.raises(RecordingError, match="--sensor-size and --wire"):
+        list(sound([some_events(2000)], 2, 2, Figures()))
+
+
+# ---- Threads
+
+
+def test_the_oldest_of_too_many_windows_is_dropped():
+    figures = Figures()
+    waiting = Waiting(2, figures)
+    waiting.fill(Arrived(some_events(1), float(k)) for k in range(5))
+    assert [window.at for window in waiting] == [3.0, 4.0] and figures.dropped == 3
+
+
+def test_an_error_of_the_reader_reaches_who_takes():
+    def broken():
+        yield Arrived(some_events(1), 0.0)
+        raise RecordingError("damaged")
+
+    waiting, taken = Waiting(2, Figures()), []
+    waiting.fill(broken())
+    with pytest.raises(RecordingError, match="damaged"):
+        taken += waiting
+    assert len(taken) == 1 or not taken
+
+
+@pytest.fixture(scope="module")
+def weights():
+    return Weights(initial_params(jax.random.key(0)), True)
+
+
+def test_pictures_are_those_of_the_batch_program(weights):
+    parts = [some_events(84, last=10_000, start=10_000 * k, seed=k) for k in range(5)]
+    figures = Figures()
+    found = pictures(
+        iter(parts), weights, height=HEIGHT, width=WIDTH, count=84, longest=10**6,
+        figures=figures, behind=10,
+    )  # fmt: skip
+    found = np.stack(list(found))
+    _, expected = events_to_pictures(
+        weights, initial_session(1, HEIGHT, WIDTH, Network()), pack([[part] for part in parts]),
+        np.ones((5, 1), bool), height=HEIGHT, width=WIDTH, settings=Display(), preview=True,
+    )  # fmt: skip
+    difference = np.abs(found.astype(int) - np.asarray(expected)[:, 0])
+    assert difference.max() <= 1  # sums of another chunk may round to the next grey
+    summary = figures.summary()
+    assert (summary["windows"], summary["dropped_windows"], summary["events"]) == (5, 0, 420)
+    assert 0 < summary["latency_ms"] <= summary["latency_95_ms"]
+
+
+# ---- The page
+
+
+@pytest.fixture
+def page():
+    board = Board()
+    server = serve(board, lambda: {"events": 7}, "a <camera>", 0)
+    yield board, server.server_address[1]
+    board.end()
+    server.shutdown()
+    server.server_close()
+
+
+def ask(port, path, host=None):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request("GET", path, headers={} if host is None else {"Host": host})
+    return connection, connection.getresponse()
+
+
+def test_the_page_and_its_figures(page):
+    _, port = page
+    connection, response = ask(port, "/")
+    assert response.status == 200 and "a &lt;camera>" in response.read().decode()
+    connection.close()
+    connection, response = ask(port, "/figures")
+    assert json.loads(response.read()) == {"events": 7}
+    connection.close()
+
+
+def test_nobody_else_may_ask(page):
+    _, port = page
+    for path, host, status in (("/", "evil.example:80", 403), ("/nothing", None, 404)):
+        connection, response = ask(port, path, host)
+        assert response.status == status
+        connection.close()
+
+
+def test_the_video_shows_the_newest_picture(page):
+    board, port = page
+    picture = np.zeros((16, 32, 3), np.uint8)
+    picture[:, 16:] = 200
+    board.hang(picture)
+    connection, response = ask(port, "/video")
+    head = [response.readline() for _ in range(4)]
+    length = int(head[2].split(b":")[1])
+    with Image.open(io.BytesIO(response.read(length))) as image:
+        shown = np.asarray(image).astype(int)
+    assert np.abs(shown - picture).max() < 8
+    connection.close()
+
+
+# ---- The command
+
+
+def write_text(path, count=6000):
+    events = some_events(count, last=300_000)
+    lines = [f"{t / 1e6:.6f} {x} {y} {int(p)}\n" for t, x, y, p in rows(events)]
+    path.write_text(f"{WIDTH} {HEIGHT}\n" + "".join(lines))
+
+
+def test_a_recording_played(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_text(tmp_path / "a.txt")
+    assert cli.main(["live", "a.txt", "--replay", "--speed", "3", "--port", "0"]) == 0
+    said = capsys.readouterr().out
+    assert "of 6,000 events" in said and "http://127.0.0.1:" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ("udp://127.0.0.1:3333", "pass --sensor-size"),
+        ("udp://nowhere --sensor-size 20x12", "expected udp://HOST:PORT"),
+        ("missing.bin --sensor-size 20x12", "no such file, and no source"),
+        ("a.txt --replay --speed 0", "speed is 0.0"),
+        ("a.txt --replay --port 70000", "ports are 0 to 65535"),
+    ],
+)
+def test_mistakes_are_one_sentence(tmp_path, monkeypatch, capsys, arguments, expected):
+    monkeypatch.chdir(tmp_path)
+    write_text(tmp_path / "a.txt", 10)
+    with contextlib.suppress(SystemExit):  # what is wrong with options alone
+        assert cli.main(["live", *arguments.split()]) == 1
+    assert expected in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_taken_port_is_one_sentence(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_text(tmp_path / "a.txt", 10)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = str(server.getsockname()[1])
+        assert cli.main(["live", "a.txt", "--replay", "--port", port]) == 1
+    assert "pass another --port" in capsys.readouterr().err
+
+
+def test_it_ends_after_so_many_seconds(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_text(tmp_path / "a.txt")
+    begun = time.monotonic()
+    arguments = "live a.txt --replay --speed 0.01 --seconds 1 --port 0"
+    assert cli.main(arguments.split()) == 0
+    assert time.monotonic() - begun < 25 and "events in" in capsys.readouterr().out
