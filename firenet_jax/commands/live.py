@@ -18,6 +18,7 @@ from firenet_jax.live.engine import Figures, pictures
 from firenet_jax.live.page import Board, serve
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
+from firenet_jax.storage.screen import Screen
 from firenet_jax.windows import LONGEST, Windows
 
 
@@ -58,6 +59,8 @@ class Live:
     """Windows that may wait; of more the oldest is dropped."""
     port: int = 8765
     """Of the page, on 127.0.0.1; 0: any that is free."""
+    show: bool = False
+    """Open a window beside the page."""
     seconds: float | None = None
     """End after so long."""
     display: Display = Display()
@@ -115,6 +118,7 @@ def run(settings: Live) -> None:
     source = source_of(settings)
     weights = load_weights(settings.weights)
     figures, board = Figures(), Board()
+    screen = Screen() if settings.show else None
     try:
         server = serve(board, figures.summary, source.name, settings.port)
     except OSError as error:
@@ -139,12 +143,16 @@ def run(settings: Live) -> None:
     try:
         for picture in shown:
             board.hang(picture)
+            if screen is not None:
+                screen.show(picture, source.name)
             _say(figures)
     except KeyboardInterrupt:
         pass
     finally:
         shown.close()
         board.end()
+        if screen is not None:
+            screen.close()
         server.shutdown()
         server.server_close()
     found = figures.summary()
