@@ -14,7 +14,7 @@ from pathlib import Path
 _PROGRAMS = None
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _PROGRAMS = os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="firenet_xla_")
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.05"
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     # XLA says of each program that it was compiled for "+prefer-no-gather", which is no feature of
     # a processor but a hint to LLVM.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
