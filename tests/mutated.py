@@ -3,10 +3,10 @@
     python tests/mutated.py --count 50000 --seed 0          an hour and more on one core
 
 Input number n is a function of the seed, n and `--only`: `--first N --count 1` runs one again.
-Inputs are small files of every format, written here, and with FIRENET_RECORDINGS and FIRENET_REFERENCE
-set real ones, or their beginnings. Refusing is a ValueError or OSError whose message is one line;
-anything else is a fault of ours: another exception, a process that ends (inputs are read in a
-worker, which is started again), more than 8 GB, more than a minute.
+Inputs are small files of every format, written here, and with FIRENET_RECORDINGS and
+FIRENET_REFERENCE set real ones, or their beginnings. Refusing is a ValueError or OSError whose
+message is one line; anything else is a fault of ours: another exception, a process that ends
+(inputs are read in a worker, which is started again), more than 8 GB, more than a minute.
 """
 
 import argparse
@@ -149,7 +149,8 @@ def _newer(made, t: list, x: list, y: list, p: list) -> None:
     cmp = np.array([0x0001, 0x1002, 0x2005, 0x3803, 0x4064, 0x5081] * 9, "<u2").tobytes()
     plain = b"".join(f.polarity31(*row) for row in rows[:40])
     for name, payload, encoding, how in (
-        ("evt3", evt3, "evt3", "lz4"), ("cmp", cmp, "libcaer_cmp", ""), ("plain", plain, "libcaer", "zstd"),
+        ("evt3", evt3, "evt3", "lz4"), ("cmp", cmp, "libcaer_cmp", ""),
+        ("plain", plain, "libcaer", "zstd"),
     ):  # fmt: skip
         chunks = [
             [(10**9 * k, f.event_packet(10**6 * k, payload, encoding, 10**9 * k))]
@@ -304,7 +305,8 @@ def run(seed: int, first: int, count: int, only: str = "") -> tuple[collections.
     counts, faults, number, stop = collections.Counter(), [], first, first + count
     while number < stop:
         command = [sys.executable, __file__, "--worker", "--seed", str(seed), "--first",
-                   str(number), "--count", str(min(stop - number, AT_ONCE)), "--only", only]  # fmt: skip
+                   str(number), "--count", str(min(stop - number, AT_ONCE)), "--only",
+                   only]  # fmt: skip
         end = min(stop, number + AT_ONCE)
         worker = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True

@@ -1197,7 +1197,7 @@ PACK = {
 
 @pytest.mark.parametrize("how", PACK)
 def test_mcap_that_was_broken_off(tmp_path, caplog, how):
-    """It has no index; then it is cut within its last chunk, whose beginning is read, packed not."""
+    """It has no index; then it is cut within its last chunk: its beginning counts if not packed."""
     pytest.importorskip("rosbags")
     whole = formats.mcap(CHUNKS, pack=PACK[how], how=how)
     t = EPOCH + 1024 * np.repeat(np.arange(120), 10)
