@@ -2,11 +2,11 @@
 
     python tests/mutated.py --count 50000 --seed 0          an hour and more on one core
 
-Input number n is a function of the seed and n alone: `--first N --count 1` runs one again. Inputs
-are small files of every format, written here, and with FIRENET_RECORDINGS and FIRENET_REFERENCE
-set real ones, or their beginnings. Refusing is a ValueError or OSError whose message is one line;
-anything else is a fault of ours: another exception, a process that ends (inputs are read in a
-worker, which is started again), more than 8 GB, more than a minute.
+Input number n is a function of the seed, n and `--only`: `--first N --count 1` runs one again.
+Inputs are small files of every format, written here, and with FIRENET_RECORDINGS and
+FIRENET_REFERENCE set real ones, or their beginnings. Refusing is a ValueError or OSError whose
+message is one line; anything else is a fault of ours: another exception, a process that ends
+(inputs are read in a worker, which is started again), more than 8 GB, more than a minute.
 """
 
 import argparse
@@ -54,7 +54,8 @@ def inputs(folder: Path) -> dict[str, Path]:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
-        found.setdefault(name.partition("/")[0], path)
+        top = name.partition("/")[0]
+        found.setdefault(top, folder / top if top.startswith("bag_") else path)
         return path
 
     text = "24 20\n" + "\n".join(rows) + "\n"
@@ -88,6 +89,7 @@ def inputs(folder: Path) -> dict[str, Path]:
     made("a.bin", np.stack(bits, 1).astype(np.uint8).tobytes())
     evt3 = np.array([0x8001, 0x6001, 0x0003, 0x2805, 0x3002, 0x4FFF, 0x50FF] * 60, "<u2")
     made("a.raw", b"% evt 3.0\n% geometry 1280x720\n% end\n" + evt3.tobytes())
+    _newer(made, t.tolist(), x.tolist(), y.tolist(), p.tolist())
     save_weights(folder / "weights.npz", Weights(_params(), True))
     found["weights.npz"] = found["resume.npz"] = folder / "weights.npz"
     made("hot.txt", b"1,1\n2,3\n17,4\n")
@@ -103,15 +105,64 @@ def inputs(folder: Path) -> dict[str, Path]:
         beginnings = {"davis346_frames.aedat4": None, "dvxplorer_face.aedat4": 60_000,
                       "ros1_event_camera_msgs.bag": 200_000, "evt2_sparklers.raw": 20_000,
                       "dvs_synthetic_sweep.es": 20_000, "davis346_59_frames.aedat4": 150_000,
-                      "evt3_driving.raw": 20_000}  # fmt: skip
+                      "evt3_driving.raw": 20_000, "davis240_boxes.aedat": 200_000,
+                      "ros2_mcap/test_events_2_0.mcap": 200_000}  # fmt: skip
         for name, size in beginnings.items():
             if (Path(samples) / name).is_file():
-                made(name, (Path(samples) / name).read_bytes()[:size])
+                made(Path(name).name, (Path(samples) / name).read_bytes()[:size])
     if reference := os.environ.get("FIRENET_REFERENCE"):
         for path in Path(reference).glob("*.pth"):
             if path.stat().st_size < 1 << 20:
                 made(path.name, path.read_bytes())
     return found
+
+
+def _newer(made, t: list, x: list, y: list, p: list) -> None:
+    """AEDAT of three versions with frames and triggers; ROS 2 in MCAP, whole and torn; EVT2."""
+    import formats as f
+    import pyarrow
+
+    frame = np.arange(24 * 20).reshape(20, 24)
+    scans = [
+        (f.pixel(i, j, 600 - 200 * exposed, exposed, 180), 1000 * exposed + i)
+        for exposed in (0, 1)
+        for i in range(240)
+        for j in range(180)
+    ]
+    rows = list(zip(t, x, y, p, strict=True))
+    davis = [(f.davis(a, b, c), time) for time, a, b, c in rows]
+    others = [(f.EDGE, 5), (f.IMU, 6)]
+    made("frames.aedat", f.aedat2(scans + others + davis))
+    made("davis.aedat", f.aedat2(others + davis))
+    made("nameless.aedat", f.aedat2(davis, chip=None))
+    dvs = [(f.dvs128(a, b, c), time) for time, a, b, c in rows]
+    made("dvs128.aedat", f.aedat2([*dvs, (1 << 15, 7)], chip="retina.DVS128"))
+    entries = [f.polarity31(*row) for row in rows]
+    pictures = [f.frame31((k, k + 9, k + 2, k + 4), frame) for k in (0, 100)]
+    specials = [f.special31(k, 2 + k % 3) for k in range(9)]
+    packets = [(0, specials), (1, entries[:200]), (2, pictures), (1, entries[200:])]
+    made("three.aedat", f.aedat31(*(f.packet31(*packet) for packet in packets)))
+    streams = {0: ("EVTS", 240, 180), 1: ("TRIG", 0, 0)}
+    edges = f.triggers4([(5 * k, k % 6) for k in range(20)])
+    made("four.aedat", f.aedat4(streams, [(0, f.events4(rows[:9])), (1, edges)]))
+    evt3 = np.array([0x8001, 0x6001, 0x0003, 0x2805, 0xA101, 0x3002, 0x4FFF] * 9, "<u2").tobytes()
+    cmp = np.array([0x0001, 0x1002, 0x2005, 0x3803, 0x4064, 0x5081] * 9, "<u2").tobytes()
+    plain = b"".join(f.polarity31(*row) for row in rows[:40])
+    for name, payload, encoding, how in (
+        ("evt3", evt3, "evt3", "lz4"), ("cmp", cmp, "libcaer_cmp", ""),
+        ("plain", plain, "libcaer", "zstd"),
+    ):  # fmt: skip
+        chunks = [
+            [(10**9 * k, f.event_packet(10**6 * k, payload, encoding, 10**9 * k))]
+            for k in range(1, 5)
+        ]
+        pack = (lambda data, how=how: pyarrow.compress(data, how, asbytes=True)) if how else None
+        made(f"{name}.mcap", f.mcap(chunks, pack=pack, how=how))
+        told = b"storage_identifier: ''\nrelative_file_paths:\n- a.mcap\n"
+        made(f"bag_{name}/metadata.yaml", told)
+        made(f"bag_{name}/a.mcap", f.mcap(chunks, pack=pack, how=how))
+    words = [0x80000001, 0x10000803, 0xA0000101, 0x00001004] * 20
+    made("two.raw", b"% evt 2.0\n% geometry 1280x720\n% end\n" + np.array(words, "<u4").tobytes())
 
 
 def _params():
@@ -190,6 +241,7 @@ def read(name: str, path: Path) -> None:
         for number, _ in enumerate(recording.events()):
             if number > 50:
                 break
+        recording.triggers()
         if recording.frames is not None:
             for number in range(min(3, len(recording.frames.times))):
                 recording.frames.read(number)
@@ -227,7 +279,7 @@ def one(seed: int, number: int, whole: dict[str, Path], folder: Path) -> tuple[s
     return name, "read"
 
 
-def work(seed: int, first: int, count: int) -> None:
+def work(seed: int, first: int, count: int, only: str = "") -> None:
     """In a process of its own: a line for each input before and after it is read."""
     import resource
 
@@ -237,20 +289,24 @@ def work(seed: int, first: int, count: int) -> None:
         folder.mkdir()
         inside.mkdir()
         whole = inputs(folder)
+        if only:
+            words = only.split(",")
+            whole = {name: path for name, path in whole.items() if any(w in name for w in words)}
         resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
         for number in range(first, first + count):
             print(json.dumps([number, "begins", ""]), flush=True)
             print(json.dumps([number, *one(seed, number, whole, inside)]), flush=True)
 
 
-def run(seed: int, first: int, count: int) -> tuple[collections.Counter, list[str]]:
+def run(seed: int, first: int, count: int, only: str = "") -> tuple[collections.Counter, list[str]]:
     """(how many came to what, the faults)"""
     import selectors
 
     counts, faults, number, stop = collections.Counter(), [], first, first + count
     while number < stop:
         command = [sys.executable, __file__, "--worker", "--seed", str(seed), "--first",
-                   str(number), "--count", str(min(stop - number, AT_ONCE))]  # fmt: skip
+                   str(number), "--count", str(min(stop - number, AT_ONCE)), "--only",
+                   only]  # fmt: skip
         end = min(stop, number + AT_ONCE)
         worker = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
@@ -294,13 +350,14 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=50_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--only", default="", help="words in the inputs' names, commas between")
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.worker:
-        work(options.seed, options.first, options.count)
+        work(options.seed, options.first, options.count, options.only)
         return 0
     began = time.monotonic()
-    counts, faults = run(options.seed, options.first, options.count)
+    counts, faults = run(options.seed, options.first, options.count, options.only)
     print(f"{dict(counts)} in {time.monotonic() - began:.0f} s")
     return 1 if faults else 0
 

@@ -14,8 +14,10 @@ import sys
 import zipfile
 from pathlib import Path
 
+import formats
 import h5py
 import numpy as np
+import pyarrow
 import pytest
 from PIL import Image
 
@@ -23,10 +25,12 @@ from firenet_jax import readers
 from firenet_jax.events import Events, RecordingError, _out_of_order, checked, concatenate
 from firenet_jax.readers import (
     aedat4,
+    camera,
     dat,
     ecd,
     evt3,
     hdf5,
+    libcaer,
     ncaltech,
     open_recording,
     rosbag,
@@ -1058,9 +1062,9 @@ def test_wrong_bags(new_bag, tmp_path):
     bag.close()
     refused(path, "holds no topic of events", "/dvs/image_raw (sensor_msgs/msg/Image)")
     path, bag = new_bag("b")
-    bag.packet(EPOCH, b"\0" * 8, "libcaer_cmp")
+    bag.packet(EPOCH, b"\0" * 8, "zip")
     bag.close()
-    refused(path, "encoded as libcaer_cmp, expected evt3 or mono")
+    refused(path, "encoded as zip, expected evt3 or libcaer or libcaer_cmp or mono")
     path, bag = new_bag("c")
     bag.events("/dvs/events", EPOCH, T[[1, 0]] + EPOCH, X[:2], Y[:2], P[:2])
     bag.close()
@@ -1079,6 +1083,218 @@ def test_wrong_bags(new_bag, tmp_path):
         refused(path, "cannot be read")
 
 
+@pytest.mark.parametrize("at_once", [1, 1 << 18])
+def test_bag_of_packets_of_iniVations_cameras(new_bag, monkeypatch, at_once):
+    """16-bit words whose times start again with each message; vectors run down a column."""
+    monkeypatch.setattr(rosbag, "WORDS", at_once)
+    path, bag = new_bag("a")
+    pieces = [
+        (0, [3 << 12 | 1, 5 << 12 | 1]),  # before the first column and base: their place is unknown
+        (7_000_000, [0x0001, 0x1002, 0x2005, 0x3803, 0x4000 | 100, 0x5081]),
+        (11_099_400, [0x5001, 0x2006, 0x1001, 0x3000 | 9, 0x0001, 0x3809]),
+    ]
+    for i, (base, words) in enumerate(pieces):
+        bag.packet(EPOCH + i, np.array(words, "<u2").tobytes(), "libcaer_cmp", base)
+    bag.close()
+    # Message 2: (5, 3) ON, (5, 100) and (5, 107) OFF at 7,000 + 4,096 + 2 us; message 3, 11,099 us:
+    # at once (5, 108) OFF, 1 us later (6, 9) OFF, and 4,096 us later (6, 9) ON.
+    t = EPOCH + 1 + np.array([0, 0, 0, 1, 2, 4098])
+    check(path, t, [5, 5, 5, 5, 6, 6], [3, 100, 107, 108, 9, 9], [1, 0, 0, 0, 0, 1], size=None)
+
+
+def test_messages_of_iniVations_cameras_all_at_once():
+    """Pieces of any length against a loop over words, as the format's description has it."""
+    rng = np.random.default_rng(0)
+    words = rng.choice([0, 1, 2, 3, 4, 5, 3, 5], 3000) << 12 | rng.integers(0, 4096, 3000)
+    words = words.astype(np.uint16)
+    starts = np.unique(np.append(0, rng.integers(0, 3000, 20)))
+    bases = np.cumsum(rng.integers(0, 10**6, len(starts)))
+    expected, high, low, x, base, on, message = [], 0, 0, None, None, 0, -1
+    for i, word in enumerate(words.tolist()):
+        if message + 1 < len(starts) and starts[message + 1] == i:
+            message, high, low = message + 1, 0, 0
+        kind, load = word >> 12, word & 0xFFF
+        time = int(bases[message]) + (high << 12 | low)
+        if kind == 0:
+            high = load
+        elif kind == 1:
+            low = load
+        elif kind == 2:
+            x = load & 0x7FF
+        elif kind == 3 and x is not None:
+            expected.append((time, x, load & 0x7FF, load >> 11))
+        elif kind == 4:
+            base, on = load & 0x7FF, load >> 11
+        elif kind == 5 and base is not None:
+            bits = [bit for bit in range(8) if load >> bit & 1 and x is not None]
+            expected += [(time, x, base + bit, on) for bit in bits]
+            base += 8
+    for cuts in ([0, len(starts)], [*range(len(starts) + 1)], [0, 3, 9, len(starts)]):
+        state, columns = libcaer.State(), []
+        for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+            first = starts[a]
+            last = starts[b] if b < len(starts) else len(words)
+            state, found = libcaer.decode(state, words[first:last], starts[a:b] - first, bases[a:b])
+            columns.append(found)
+        found = np.stack([np.concatenate(c) for c in zip(*columns, strict=True)], 1)
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_bag_of_plain_packets_of_iniVations_cameras(new_bag):
+    path, bag = new_bag("a")
+    for base, rows in ((0, EVENTS[:3]), (1000 * 10**6, EVENTS[3:])):
+        words = [(x << 17 | y << 2 | p << 1 | 1, t - base // 1000) for t, x, y, p in rows]
+        words = [(data, t & 0xFFFFFFFF) for data, t in words]
+        bag.packet(EPOCH, np.array(words, "<u4").tobytes(), "libcaer", base)
+    bag.close()
+    assert events_of(path, None).t[0] == EPOCH
+
+
+def test_triggers_of_bags(new_bag):
+    """They are moved as the events are, those before the first event too."""
+    path, bag = new_bag("a")
+    pieces = [
+        [0xA100],  # before the first time
+        [high(0xFFF), low(0xFF0), 0xA301, row(3), 0xA300],
+        [low(0xFF2), single(11)],
+        [high(0), low(4), 0xAF01, single(3)],
+    ]
+    for i, words in enumerate(pieces):
+        bag.packet(EPOCH + i, np.array(words, "<u2").tobytes())
+    bag.close()
+    assert events_of(path, None).t.tolist() == [EPOCH + 2, EPOCH + 2 + 18]
+    times, ids, rises = open_recording(path).triggers()
+    assert times.tolist() == [EPOCH, EPOCH, EPOCH + 20]
+    assert ids.tolist() == [3, 3, 15] and rises.tolist() == [True, False, True]
+    path, bag = new_bag("b")
+    bag.packet(EPOCH, np.array([*pieces[2], *pieces[3][:2], single(1)], "<u2").tobytes())
+    bag.close()
+    assert open_recording(path, (1, 20)).triggers() is None
+
+
+# ---------------------------------------------------------------- MCAP
+
+
+def payload(number: int) -> bytes:
+    """10 events 1.024 ms after those of the last number; x counts on."""
+    start = [high(number >> 2), low((number & 3) << 10), row(3)]
+    return np.array([*start, *(single(10 * (number % 30) + k) for k in range(10))], "<u2").tobytes()
+
+
+def packets(count: int, first=0) -> list[tuple[int, bytes]]:
+    times = [EPOCH + 1024 * number for number in range(first, first + count)]
+    made = (formats.event_packet(t, payload(first + i), "evt3") for i, t in enumerate(times))
+    return [(1000 * t, data) for t, data in zip(times, made, strict=True)]
+
+
+CHUNKS = [packets(40), packets(40, 40), packets(40, 80)]
+PACK = {
+    "": None,
+    "lz4": lambda data: pyarrow.compress(data, "lz4", asbytes=True),
+    "zstd": lambda data: pyarrow.compress(data, "zstd", asbytes=True),
+}
+
+
+@pytest.mark.parametrize("how", PACK)
+def test_mcap_that_was_broken_off(tmp_path, caplog, how):
+    """It has no index; then it is cut within its last chunk: its beginning counts if not packed."""
+    pytest.importorskip("rosbags")
+    whole = formats.mcap(CHUNKS, pack=PACK[how], how=how)
+    t = EPOCH + 1024 * np.repeat(np.arange(120), 10)
+    size = 9 + 22 + len(CHUNKS[0][0][1])  # of a message's record; an index of 15 bytes is behind
+    cut = whole[:-300], 80 if how else 120 - -((15 - 300) // size)
+    for name, (data, left) in (("a.mcap", (whole, 120)), ("b.mcap", cut)):
+        path = write(tmp_path / name, data)
+        caplog.clear()
+        events = events_of(path, None)
+        np.testing.assert_array_equal(events.t, t[: 10 * left])
+        np.testing.assert_array_equal(events.x, np.arange(10 * left) % 300)
+        assert f"what comes before is read: {10 * left:,} events" in caplog.text
+        refused(path, "it has no index, so it ends early", size=None)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_mcap_in_parts_and_without_a_storage_plugin(tmp_path, named):
+    """The metadata name the parts in their order; else that of their names counts."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    (tmp_path / "bag").mkdir()
+    for number, name in enumerate(["z.mcap", "a.mcap"] if named else ["a.mcap", "z.mcap"]):
+        bag = Bag(tmp_path / name[0], 2, storage_plugin=rosbag2.StoragePlugin.MCAP)
+        for k in range(5 * number, 5 * number + 5):
+            bag.packet(EPOCH + 1024 * k, payload(k))
+        bag.close()
+        next((tmp_path / name[0]).glob("*.mcap")).rename(tmp_path / "bag" / name)
+    told = 'rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: ""\n'
+    told += "  relative_file_paths:\n    - z.mcap\n    - 'a.mcap'\n"
+    write(tmp_path / "bag/metadata.yaml", told if named else "hello")
+    times = EPOCH + 1024 * np.repeat(np.arange(10), 10)
+    assert events_of(tmp_path / "bag", None, strict=True).t.tolist() == times.tolist()
+    (tmp_path / "bag/a.mcap").unlink()
+    if named:
+        refused(tmp_path / "bag", "cannot be read", size=None)
+
+
+@pytest.mark.parametrize("storage", ["", "other"])
+def test_whole_mcap_without_a_storage_plugin(tmp_path, storage):
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    bag = Bag(tmp_path / "a", 2, storage_plugin=rosbag2.StoragePlugin.MCAP)
+    bag.events("/dvs/events", EPOCH, T[:3] + EPOCH, X[:3], Y[:3], P[:3])
+    bag.image("/dvs/image_raw", EPOCH + 7, FRAME)
+    bag.events("/dvs/events", EPOCH + 20, T[3:] + EPOCH, X[3:], Y[3:], P[3:])
+    bag.image("/dvs/image_raw", EPOCH + 30, FRAME[::-1])
+    bag.close()
+    told = (tmp_path / "a/metadata.yaml").read_text()
+    assert "storage_identifier: mcap" in told
+    told = told.replace("storage_identifier: mcap", f"storage_identifier: '{storage}'")
+    write(tmp_path / "a/metadata.yaml", told)
+    (file,) = (tmp_path / "a").glob("*.mcap")
+    for path in (tmp_path / "a", file):
+        check(path, t=T + EPOCH, size=None)
+        check_frames(path, [EPOCH + 7, EPOCH + 30])
+
+
+# ---------------------------------------------------------------- triggers of Prophesee's files
+
+
+def test_triggers_of_evt2(tmp_path):
+    """At the times of events, which faery reads, across the end of the clock's 34 bits."""
+    pytest.importorskip("faery")
+    words, times = [0xA << 28], [100, 5000, 2**34 - 100, 2**34 + 70, 2**34 + 10**6]
+    for i, t in enumerate(times):
+        words.append(0x8 << 28 | t >> 6 & 0xFFFFFFF)
+        words.append(i % 2 << 28 | (t & 63) << 22 | i << 11 | 3)
+        words.append(0xA << 28 | (t & 63) << 22 | i + 20 << 8 | i % 2)
+    body = np.array(words, "<u4").tobytes()
+    path = write(tmp_path / "a.raw", b"% evt 2.0\n% geometry 640x480\n% end\n" + body)
+    assert events_of(path, None).t.tolist() == times
+    found = open_recording(path).triggers()
+    assert found.times.tolist() == times and found.ids.tolist() == [20, 21, 22, 23, 24]
+    assert found.polarity.tolist() == [False, True, False, True, False]
+
+
+@pytest.mark.parametrize("chunk", [1000, 1 << 18])
+def test_triggers_of_evt3(tmp_path, monkeypatch, chunk):
+    """At the times of events, which faery reads, while the clock starts again twice."""
+    pytest.importorskip("faery")
+    monkeypatch.setattr(camera, "CHUNK", chunk)
+    words, last, times = [], -1, list(range(100, 3 << 24, 40_001))
+    for i, t in enumerate(times):
+        words += [high(k) for k in range(last + 1, (t >> 12) + 1)]
+        last = t >> 12
+        words += [low(t & 0xFFF), row(3), single(i % 640), 0xA000 | i % 16 << 8 | i % 3 % 2]
+    body = np.array(words, "<u2").tobytes()
+    path = write(tmp_path / "a.raw", b"% evt 3.0\n% geometry 640x480\n% end\n" + body)
+    assert events_of(path, None).t.tolist() == times
+    found, order = open_recording(path).triggers(), np.arange(len(times))
+    assert found.times.tolist() == times
+    assert found.ids.tolist() == (order % 16).tolist()
+    assert found.polarity.tolist() == (order % 3 == 1).tolist()
+
+
+def test_what_has_no_triggers(tmp_path):
+    assert open_recording(write(tmp_path / "a.txt", TEXTS["size"])).triggers() is None
+
+
 # ---------------------------------------------------------------- real recordings
 
 # file: needs, (height, width), whether the file says it, events, first time, seconds, x, y up to
@@ -1094,6 +1310,10 @@ SAMPLES = {
     "dvs_synthetic_sweep.es": ("faery", (240, 320), True, 473_225, 0, 0.999, 319, 239),
     "ros1_event_camera_msgs.bag": ("rosbags", (480, 640), True, 343_474, None, 2.078178, 639, 479),
     "ros2_event_camera_msgs": ("rosbags", (480, 640), True, 343_474, None, 2.078178, 639, 479),
+    "ros2_evt3_trigger": ("rosbags", (720, 1280), True, 82_469, None, 1.251317, 1279, 719),
+    "ros2_mcap": ("rosbags", (260, 346), True, 571_266, None, 0.999996, 345, 259),
+    "davis240_boxes.aedat": (None, (180, 240), True, 162_771, 294_976_755, 2.072651, 239, 179),
+    "davis240_rotating_disk.aedat": (None, (180, 240), True, 374_296, 341_678, None, 239, 179),
 }
 
 
@@ -1109,7 +1329,7 @@ def test_sample(recordings, caplog, name):
     for _ in range(2):  # every call starts from the first event
         events = concatenate(list(recording.events()))
         assert len(events) == count
-        assert events.t[-1] - events.t[0] == round(seconds * 1e6)
+        assert seconds is None or events.t[-1] - events.t[0] == round(seconds * 1e6)
     assert start in (None, events.t[0])
     assert (events.x.max(), events.y.max()) == (x, y)
     assert 0.3 < events.p.mean() < 0.7
@@ -1164,6 +1384,31 @@ def test_evt3_against_faery(recordings):
     assert np.diff(t).min() >= 0
 
 
+def test_bags_against_the_sums_of_the_formats_own_tests(recordings, monkeypatch):
+    """event_camera_codecs, test/decoder_test.cpp (sums of sensor times in ns, x, y, p, and of the
+    triggers' times, edges, inputs); event_camera_py, tests/test_2.py (OFF and ON events).
+
+    They even out no times, and tell the sensor's."""
+    pytest.importorskip("rosbags")
+    monkeypatch.setattr(evt3, "JITTER", -1)
+    path = recordings / "ros2_evt3_trigger"
+    with rosbag._bag(path) as bag:
+        packed = b"".join(
+            rosbag._packet(rosbag._Message(raw, True)).payload
+            for _, raw in rosbag._raw(bag, "/event_camera/events")
+        )
+    words = np.frombuffer(packed, "<u2")
+    sums = [int(column.sum()) for column in evt3.decode(evt3.State(), words)[1]]
+    assert sums == [1_222_326_831_810, 42_078_718, 31_656_267, 41_439]
+    times, ids, rises = evt3.triggers(evt3.State(), words)[1]
+    assert (times.sum(), rises.sum(), ids.sum(), len(times)) == (29_096_982, 1, 0, 2)
+    events, triggers = events_of(path, None), open_recording(path).triggers()
+    first = evt3.decode(evt3.State(), words)[1][0][0]
+    assert (triggers.times - events.t[0]).tolist() == (times - first).tolist()
+    events = events_of(recordings / "ros2_mcap", None)
+    assert (int((~events.p).sum()), int(events.p.sum())) == (360_223, 211_043)
+
+
 def test_damaged_samples(recordings, tmp_path):
     for name in ("davis346_frames.aedat4", "ros1_event_camera_msgs.bag", "e2vid_slider_depth.zip"):
         content = (recordings / name).read_bytes()
@@ -1171,7 +1416,8 @@ def test_damaged_samples(recordings, tmp_path):
         refused(path, "cannot be read", size=(480, 640))
 
 
-CUT = ["davis346_frames.aedat4", "evt2_sparklers.raw", "evt3_driving.raw", "dvs_synthetic_sweep.es",
+CUT = ["davis240_boxes.aedat", "ros2_mcap/test_events_2_0.mcap",
+       "davis346_frames.aedat4", "evt2_sparklers.raw", "evt3_driving.raw", "dvs_synthetic_sweep.es",
        "ncars.dat", "ncaltech101_faces_easy_0001.bin", "ros1_event_camera_msgs.bag"]  # fmt: skip
 
 
@@ -1193,7 +1439,11 @@ def test_half_a_sample_gives_half_of_its_events(recordings, tmp_path, caplog, na
     if name.endswith(".es"):
         return  # the file does not say how long it is
     assert caplog.text.count(f"what comes before is read: {len(events):,} events") == 1
-    refused(recording.path, "cut off" if "bag" not in name else "ends early", size=(720, 1280))
+    refused(
+        recording.path,
+        "ends early" if "bag" in name or "mcap" in name else "cut off",
+        size=(720, 1280),
+    )
 
 
 @pytest.mark.parametrize("name", ["davis346_59_frames", "davis346_frames", "dvxplorer_face"])

@@ -68,9 +68,8 @@ def matches(path: Path) -> bool:
 def read(path: Path) -> Source:
     version = aedat.version(path)
     if version != "3.1":
-        raise RecordingError(
-            f"{path}: is AEDAT-{version or 'of no version'}, expected 3.1: convert it with DV"
-        )
+        found = "names no version of AEDAT" if version is None else f"is AEDAT-{version}"
+        raise RecordingError(f"{path}: {found}, expected 3.1 in its first line: convert it with DV")
     with open(path, "rb") as file:
         lines = aedat.read_header(file)
         begin = file.tell()

@@ -72,21 +72,33 @@ class Torn:
                 file.seek(size, io.SEEK_CUR)
                 continue
             data = file.read(size) if size <= LARGEST else b""
-            if len(data) != size:
-                raise EOFError("ends within a record")
-            if kind == SCHEMA:
+            whole = len(data) == size
+            if kind == CHUNK and not isinstance(file, io.BytesIO):
+                yield from self._sorted(_unpacked(data))
+            elif not whole or kind == CHUNK:
+                raise EOFError("ends within a record, or has a chunk within a chunk")
+            elif kind == SCHEMA:
                 self.schemas[struct.unpack_from("<H", data)[0]] = _text(data, 2)[0]
             elif kind == CHANNEL:
                 number, schema = struct.unpack_from("<HH", data)
                 self.known[number] = Connection(_text(data, 4)[0], self.schemas.get(schema, ""))
-            elif kind == MESSAGE:
+            else:
                 number, _, time, _ = struct.unpack_from("<HIQQ", data)
                 yield self.known[number], time, data[22:]
-            elif isinstance(file, io.BytesIO):
-                raise ValueError("a chunk within a chunk")
-            else:
-                inside = self._inside(io.BytesIO(_unpacked(data)))
-                yield from sorted(inside, key=lambda message: message[1])  # as an index would
+            if not whole:
+                raise EOFError("ends within a chunk")
+
+    def _sorted(self, chunk: bytes) -> Iterator[tuple]:
+        """The messages of a chunk by their times, as an index would have them, up to damage."""
+        messages, damage = [], None
+        try:
+            for message in self._inside(io.BytesIO(chunk)):
+                messages.append(message)
+        except (ValueError, KeyError, struct.error, EOFError) as error:
+            damage = error
+        yield from sorted(messages, key=lambda message: message[1])
+        if damage is not None:
+            raise damage
 
 
 def _text(data: bytes, at: int) -> tuple[str, int]:
