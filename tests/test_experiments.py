@@ -29,6 +29,7 @@ SMALL = {
     "figure6_limitations": "--seconds 0.2 --sequences 1",
     "file_to_pictures": "--events 60000 --runs 1",
     "memory": "--hdf5 200000 --text 200000 --runs 1",
+    "onnxruntime_step": "--sizes 48x32 --windows 2 --runs 1",
     "readme_picture": f"{WEIGHTS} {{recording}}",
     "scaling": "--quick",
     "shipped_weights": f"{WEIGHTS} {{recording}} --skip-simulated",
