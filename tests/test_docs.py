@@ -31,7 +31,8 @@ def commands(page):
 def test_commands_have_these_options(page):
     for line in commands(page):
         name, *rest = shlex.split(line)[1:]
-        if "--help" in rest or any(word.isupper() or word == "..." for word in rest):
+        no_values = rest and rest[-1].startswith("-")  # `firenet train --data`, in a sentence
+        if "--help" in rest or no_values or any(word.isupper() or word == "..." for word in rest):
             continue
         module, settings, _ = cli.COMMANDS[name]
         kind = getattr(importlib.import_module(module), settings)

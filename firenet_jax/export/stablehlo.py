@@ -1,6 +1,6 @@
 """Weights -> one step of FireNet as JAX exports programs: StableHLO, any platform and size.
 
-    step = jax.export.deserialize(open("model.stablehlo", "rb").read()).call
+    step = jax.jit(jax.export.deserialize(open("model.stablehlo", "rb").read()).call)
     image, g1, g2 = step(events, g1, g2)  # perhaps picture too
 
 events (batch, height, width, 5), g1, g2 (batch, height, width, 16) and image
