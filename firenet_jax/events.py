@@ -134,6 +134,14 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'s' * (number != 1)}"
 
 
+def rate_in_words(rate: float) -> str:
+    """ "2.31 Mev/s", "46.2 kev/s", "20 ev/s" """
+    for scale, unit in ((1e6, "Mev/s"), (1e3, "kev/s")):
+        if rate >= scale:
+            return f"{rate / scale:.3g} {unit}"
+    return f"{rate:.3g} ev/s"
+
+
 def event_number(row: int) -> str:
     """The place of an event, counted from 1, in a file that has no lines."""
     return f"event {row + 1}"

@@ -23,6 +23,7 @@ from test_pipeline import write_recording
 from firenet_jax import cli
 from firenet_jax.checkpoint import save_weights
 from firenet_jax.commands import info, options, reconstruct
+from firenet_jax.events import rate_in_words
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import Network
@@ -281,7 +282,13 @@ def test_info_names_hot_pixels_by_column_and_row(here, capsys):
     rows = [f"{k / 1e4:.4f} {k % 24} {k // 24 % 20} 1" for k in range(480)]
     text_with(here / "hot.txt", [*rows, *["0.5 17 4 1"] * 400])
     assert json.loads(firenet(capsys, "info hot.txt --json")[1])["hot_pixels"] == [[17, 4]]
-    assert "1, (x,y): (17,4)" in firenet(capsys, "info hot.txt")[1]
+    out = firenet(capsys, "info hot.txt")[1]
+    assert "1, (x,y): (17,4)" in out and re.search(r"rate +\d+ ev/s", out)
+
+
+def test_rates_in_words_are_never_nothing():
+    rates = {2.306e6: "2.31 Mev/s", 46_200: "46.2 kev/s", 20: "20 ev/s", 0.155: "0.155 ev/s"}
+    assert [rate_in_words(rate) for rate in rates] == list(rates.values())
 
 
 def test_options_of_the_original_program_are_explained(here, capsys):

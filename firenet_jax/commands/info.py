@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from firenet_jax.events import RecordingError, counted, parse_size, until_damage
+from firenet_jax.events import RecordingError, counted, parse_size, rate_in_words, until_damage
 from firenet_jax.filters import hot_pixels_of
 from firenet_jax.readers import open_recording
 from firenet_jax.storage.progress import Bytes, bar
@@ -111,7 +111,7 @@ def run(settings: Info) -> None:
         + (" (inferred from the events)" if facts["sensor_size_inferred"] else ""),
         "events": f"{facts['events']:,}",
         "duration": f"{facts['duration_s']:.6f} s, from {facts['first_event_us']} us",
-        "rate": "all at one time" if rate is None else f"{rate / 1e6:.3f} million events/s",
+        "rate": "all at one time" if rate is None else rate_in_words(rate),
         "polarity": f"{facts['on_share']:.1%} ON",
         "frames": f"{facts['frames']}" if facts["frames"] else "none",
         "triggers": f"{facts['triggers']:,} at "

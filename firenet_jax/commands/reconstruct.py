@@ -34,6 +34,7 @@ from firenet_jax.events import (
     counted,
     logger,
     parse_size,
+    rate_in_words,
     until_damage,
 )
 from firenet_jax.network import Weights
@@ -309,11 +310,6 @@ def closing_line(said: dict[Path, Said], jobs: dict[Path, Job], seconds: float) 
         f"{', '.join(map(str, said))}: {counted(pictures, 'picture')} of "
         f"{counted(events, 'event')} in {seconds:.1f} s ({rates}); {', '.join(ways)}{plays}"
     )
-
-
-def rate_in_words(rate: float) -> str:
-    """ "2.31 Mev/s", "46.2 kev/s" """
-    return f"{rate / 1e6:.2f} Mev/s" if rate >= 1e6 else f"{rate / 1e3:.3g} kev/s"
 
 
 def factor_in_words(slower: float) -> str:
