@@ -30,7 +30,7 @@ COMMANDS = {
         "Simulate",
         "training data, or a video file -> events",
     ),
-    "train": ("firenet_jax.training.run", "Train", "simulated sequences -> weights"),
+    "train": ("firenet_jax.commands.train", "Train", "simulated sequences -> weights"),
     "evaluate": (
         "firenet_jax.commands.evaluate",
         "Evaluate",

@@ -24,6 +24,11 @@ def join(coordinator: str | None, processes: int | None, process: int | None) ->
         jax.distributed.initialize(coordinator, processes, process)
 
 
+def is_first() -> bool:
+    """Whether this is the process that writes and talks."""
+    return jax.process_index() == 0
+
+
 def check_processes(coordinator: str | None, processes: int | None, process: int | None) -> None:
     """Raises ValueError unless all of the three are given, or none."""
     together = [coordinator, processes, process]

@@ -161,7 +161,7 @@ def read(name: str, path: Path) -> None:
     from firenet_jax.simulation import textures
     from firenet_jax.storage.files import read_arrays
     from firenet_jax.training import batches
-    from firenet_jax.training import run as train
+    from firenet_jax.training import log as training_log
 
     if name == "hot.txt":
         read_hot_pixels(path, 20, 24)
@@ -182,8 +182,8 @@ def read(name: str, path: Path) -> None:
     elif name.startswith("picture"):
         textures.load_textures(path.parent, 1, 32, 0)
     elif name == "log.jsonl":
-        log = train.Log.__new__(train.Log)
-        log.entries = [entry for entry in train._entries(path) if entry["step"] <= 100]
+        log = training_log.Log.__new__(training_log.Log)
+        log.entries = [entry for entry in training_log._entries(path) if entry["step"] <= 100]
         f"{log.best():.4f}"
     else:
         recording = open_recording(path)

@@ -28,7 +28,7 @@ LAYERS = [
 ]
 # Each outside library enters by one door.
 DOORS = {
-    "flax": {"network", "evaluation.baselines"}, "optax": {"training.run"},
+    "flax": {"network", "evaluation.baselines"}, "optax": {"training.step"},
     "orbax": {"training.run"}, "torch": set(), "av": {"storage.video", "commands.simulate"},
     "h5py": {"readers", "training.batches", "commands.simulate", "commands.evaluate"},
     "pyarrow": {"readers"}, "grain": {"training.batches"}, "faery": {"readers"},

@@ -51,8 +51,6 @@ from firenet_jax.readers.hdf5 import opened
 from firenet_jax.simulation.scenes import check_seed
 from firenet_jax.storage.files import (
     OutputError,
-    alone_in,
-    differences,
     identity,
     named,
     read_arrays,
@@ -61,6 +59,7 @@ from firenet_jax.storage.files import (
 )
 from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import bar
+from firenet_jax.storage.runs import alone_in, check_same, differences, make_folder, read_record
 from firenet_jax.storage.video import write_video
 from firenet_jax.windows import Window, Windows, cut
 
@@ -453,23 +452,18 @@ def open_folder(settings: Evaluate, records: dict[tuple[str, str], dict]) -> dic
         path = result_file(settings, *key)
         if not (path.is_file() and path.with_suffix(".npz").is_file()):
             continue
-        try:
-            saved = json.loads(path.read_text())
-            other = differences(saved["record"], record)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise OutputError(f"{path} is damaged ({error}): remove it") from error
-        if not other:
+        saved = read_record(path, "remove it")
+        if not (saved and isinstance(saved.get("record"), dict) and "result" in saved):
+            raise OutputError(f"{path} is damaged: remove it")
+        if not settings.overwrite:
+            check_same(
+                saved["record"], record, f"{path} was made with other settings",
+                "choose another output, or pass --overwrite to compute it again",
+            )  # fmt: skip
+        if not differences(saved["record"], record):
             done[key] = saved["result"]
-        elif not settings.overwrite:
-            raise OutputError(
-                f"{path} was made with other settings ({', '.join(other)}): choose another output, "
-                "or pass --overwrite to compute it again"
-            )
     for key in records:
-        try:
-            result_file(settings, *key).parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"{folder}: cannot make it ({error.strerror})") from error
+        make_folder(result_file(settings, *key).parent)
     if done:
         logger.warning("%s: going on, %d of %d results are there", folder, len(done), len(records))
     return done

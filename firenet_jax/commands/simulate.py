@@ -14,7 +14,6 @@ period: times the period, what was at x - d(x) in the last image is at x now (ba
 A file appears under its name when it is whole, so a run that was interrupted goes on where it was.
 """
 
-import dataclasses
 import importlib.metadata
 import io
 import itertools
@@ -54,14 +53,21 @@ from firenet_jax.simulation.sensor import (
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage.files import (
     OutputError,
-    alone_in,
-    differences,
     partial_name,
     write_text,
     writing,
 )
 from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import bar
+from firenet_jax.storage.runs import (
+    alone_in,
+    as_text,
+    check_same,
+    differences,
+    make_folder,
+    read_record,
+    recorded,
+)
 
 ROWS = 1 << 16  # events in a chunk of the file, and so many are written at once
 GZIP = 4  # for 50 % more time than level 1: events take 10 % less room, flow 25 %
@@ -470,46 +476,35 @@ def rounded_flow(velocity: np.ndarray) -> np.ndarray:
 
 def describe(settings: Simulate) -> dict:
     """All that a sequence depends on, apart from its number; ready for JSON."""
-    choices = dataclasses.asdict(settings)
-    for name in ("output", "sequences", "validation", "video", "overwrite"):
-        del choices[name]
-    choices["images"] = None if settings.images is None else str(settings.images.resolve())
-    choices["sensor_size"] = settings.sensor_size or "240x180"
-    choices["version"] = importlib.metadata.version("firenet-jax")
-    return json.loads(json.dumps(choices))
+    return recorded(
+        settings,
+        but=("output", "sequences", "validation", "video", "overwrite"),
+        images=None if settings.images is None else settings.images.resolve(),
+        sensor_size=settings.sensor_size or "240x180",
+        version=importlib.metadata.version("firenet-jax"),
+    )
 
 
 def open_folder(settings: Simulate) -> None:
     """Finds that the folder is new or one to go on with; else raises OutputError."""
     folder, record = settings.output, describe(settings)
     kept = folder / "settings.json"
-    if kept.is_file():
-        try:
-            found = json.loads(kept.read_text())
-        except (OSError, ValueError) as error:
-            raise OutputError(f"{kept} is damaged ({error}): choose another output") from error
-        other = differences(found, record)
-        if other and not next(folder.glob("*/??????.h5"), None):
-            kept.unlink()  # an earlier run wrote nothing else
-        elif other:
-            raise OutputError(
-                f"{folder} holds sequences of other settings ({', '.join(other)}): choose another "
-                "output, or go on with the same settings"
-            )
-    elif folder.is_dir() and any(folder.iterdir()):
+    found = read_record(kept, "choose another output")
+    if found is None and any(folder.iterdir()):
         raise OutputError(
             f"{folder} is not empty, and holds no settings.json of an earlier run: choose another "
             "output"
         )
-    try:
-        for name in ("train", "validation"):
-            (folder / name).mkdir(parents=True, exist_ok=True)
-        if not kept.is_file():
-            write_text(kept, json.dumps(record, indent=1) + "\n")
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: cannot write there ({error.strerror or error}): choose another output"
-        ) from error
+    empty = not next(folder.glob("*/??????.h5"), None)
+    if found is not None and not empty:
+        check_same(
+            found, record, f"{folder} holds sequences of other settings",
+            "choose another output, or go on with the same settings",
+        )  # fmt: skip
+    for name in ("train", "validation"):
+        make_folder(folder / name)
+    if found is None or differences(found, record):
+        write_text(kept, as_text(record) + "\n")
 
 
 def in_words(size: float) -> str:
@@ -537,10 +532,7 @@ def simulate_clip(settings: Simulate) -> Path:
         raise OutputError(f"{path}: with --video the output is one file: name it {path}.h5")
     if path.is_dir() or (path.exists() and not settings.overwrite):
         raise OutputError(f"{path} exists: choose another output or pass --overwrite")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{path.parent}: cannot make this folder ({error.strerror})") from error
+    make_folder(path.parent)
     size = parse_size(settings.sensor_size)
     pictures = list(itertools.islice(read_clip(clip, size), 2))
     if len(pictures) < 2:
