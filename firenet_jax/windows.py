@@ -14,6 +14,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import tyro
 
+from firenet_jax.errors import SettingsError
 from firenet_jax.events import (
     Events,
     Recording,
@@ -146,13 +147,15 @@ def cut(
     if windows.duration is not None:
         step = windows.duration if windows.step is None else windows.step
         if step > windows.duration:
-            raise ValueError(f"step of {step} ms is longer than the window, {windows.duration} ms")
+            raise SettingsError(
+                f"step of {step} ms is longer than the window, {windows.duration} ms"
+            )
         spans = partial(_grid_spans, windows.duration, step)
         return _by_time(recording.path, chunks, begin, spans)
     count = windows.count(recording.pixels)
     step = count if windows.step is None else int(windows.step)
     if step > count:
-        raise ValueError(f"step of {step} events is longer than the window, {count} events")
+        raise SettingsError(f"step of {step} events is longer than the window, {count} events")
     warn_if_unusual(count, recording.pixels)
     if windows.longest is not None:
         return _by_count_or_time(chunks, count, round(1000 * windows.longest))

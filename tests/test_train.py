@@ -164,12 +164,11 @@ def test_runs_that_differ_in_paths_compile_one_step(tmp_path, monkeypatch):
 
     monkeypatch.setattr(train_steps, "loss_of", counted)
     train_step.clear_cache()
-    source = jax.random.key(0), jnp.zeros((4, 64, 64))
+    state, source = first_state(tiny(tmp_path)), (jax.random.key(0), jnp.zeros((4, 64, 64)))
     for asked in (
         tiny(tmp_path / "one"),
         tiny(tmp_path / "two", images=tmp_path, weights=tmp_path, seed=3, save_every=9.0),
     ):
-        state = jax.eval_shape(lambda: first_state(tiny(tmp_path)))
         train_step.eval_shape(state, source, asked.step_settings)
     assert len(traced) == 1
     train_step.eval_shape(state, source, tiny(tmp_path, clip=0.5).step_settings)

@@ -33,11 +33,12 @@ import jax
 import numpy as np
 import tyro
 
-from firenet_jax.events import Events, concatenate, parse_size
+from firenet_jax.errors import OutputError, PictureError, SettingsError
+from firenet_jax.events import Events, concatenate
+from firenet_jax.settings import check_seed, parse_size
 from firenet_jax.simulation.scenes import (
     Scene,
     SceneSettings,
-    check_seed,
     flow,
     random_scene,
     rendering_times,
@@ -51,12 +52,7 @@ from firenet_jax.simulation.sensor import (
     with_faults,
 )
 from firenet_jax.simulation.textures import load_textures
-from firenet_jax.storage.files import (
-    OutputError,
-    partial_name,
-    write_text,
-    writing,
-)
+from firenet_jax.storage.files import partial_name, write_text, writing
 from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import bar
 from firenet_jax.storage.runs import (
@@ -122,16 +118,16 @@ class Simulate:
 
     def __post_init__(self):
         if not 0 < self.seconds <= LONGEST_SCENE:
-            raise ValueError(
+            raise SettingsError(
                 f"seconds is {self.seconds}, but a sequence lasts more than 0 and up to "
                 f"{LONGEST_SCENE:g}: make more sequences instead"
             )
         if not 0 < self.fps <= 1e5:
-            raise ValueError(f"fps is {self.fps}, but must be more than 0 and up to 100000")
+            raise SettingsError(f"fps is {self.fps}, but must be more than 0 and up to 100000")
         if self.sequences < 1:
-            raise ValueError(f"sequences is {self.sequences}, but must be 1 or more")
+            raise SettingsError(f"sequences is {self.sequences}, but must be 1 or more")
         if self.validation is not None and not 0 <= self.validation <= self.sequences:
-            raise ValueError(
+            raise SettingsError(
                 f"validation is {self.validation}, but must be between 0 and the number of "
                 f"sequences, {self.sequences}"
             )
@@ -140,7 +136,7 @@ class Simulate:
         if self.video is not None:
             idle = [name for name in OF_SCENES if getattr(self, name) != getattr(Simulate, name)]
             if idle:
-                raise ValueError(
+                raise SettingsError(
                     f"{', '.join(idle)}: no part in turning a video into events: leave it out"
                 )
 
@@ -536,7 +532,9 @@ def simulate_clip(settings: Simulate) -> Path:
     size = parse_size(settings.sensor_size)
     pictures = list(itertools.islice(read_clip(clip, size), 2))
     if len(pictures) < 2:
-        raise ValueError(f"{clip}: holds fewer than two pictures, so no change: name a video file")
+        raise PictureError(
+            f"{clip}: holds fewer than two pictures, so no change: name a video file"
+        )
     height, width = pictures[0].image.shape
     sensor = with_faults(settings.sensor) if settings.faults else settings.sensor
     camera = random_sensor(
@@ -573,7 +571,7 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
     try:
         with av.open(str(path), metadata_errors="replace") as container:
             if not container.streams.video or container.format.name == "tty":  # any text is
-                raise ValueError(f"{path}: holds no video, only sound or text: name a video file")
+                raise PictureError(f"{path}: holds no video, only sound or text: name a video file")
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             period = 1 / (stream.average_rate or Fraction(25))
@@ -582,7 +580,7 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
                 first = seconds if first is None else first
                 time = round((seconds - first) * 1_000_000)
                 if last is not None and not 0 < time - last <= LONGEST:
-                    raise ValueError(
+                    raise PictureError(
                         f"{path}: picture {number + 1} comes {(time - last) * 1e-6:g} s after the "
                         f"one before, expected more than 0 and up to {LONGEST * 1e-6:.1f}: "
                         "convert the clip to a constant rate"
@@ -595,6 +593,6 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
                 yield Picture(time, np.round(grey).astype(np.uint8), None)
     except (av.FFmpegError, OSError, UnicodeDecodeError) as error:  # names in it that are no text
         reason = getattr(error, "strerror", None) or error
-        raise ValueError(
+        raise PictureError(
             f"{path}: cannot be read as a video ({reason}): name a file that ffmpeg can play"
         ) from error

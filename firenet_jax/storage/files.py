@@ -10,9 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-
-class OutputError(ValueError):
-    """A file cannot be written as asked; the message is one sentence."""
+from firenet_jax.errors import OutputError
 
 
 def named(path: Path) -> Path:

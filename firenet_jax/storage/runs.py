@@ -21,7 +21,8 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from firenet_jax.storage.files import OutputError, locked
+from firenet_jax.errors import OutputError
+from firenet_jax.storage.files import locked
 
 
 def recorded(settings: Any, but: Collection[str] = (), **others: Any) -> dict:

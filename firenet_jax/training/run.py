@@ -27,13 +27,13 @@ import orbax.checkpoint as ocp
 from jax.experimental import multihost_utils
 
 from firenet_jax.checkpoint import load_weights
-from firenet_jax.devices import TIME_BATCH, everywhere, is_first, join, shared
-from firenet_jax.events import logger
+from firenet_jax.devices import TIME_BATCH, is_first, join, replicated, sharding
+from firenet_jax.errors import CheckpointError, FirenetError, OutputError, SettingsError, logger
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.simulation.sensor import Simulation
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage import runs
-from firenet_jax.storage.files import OutputError, locked, write_text
+from firenet_jax.storage.files import locked, write_text
 from firenet_jax.storage.progress import bar
 from firenet_jax.training.batches import NOTHING, batches, split
 from firenet_jax.training.log import Log
@@ -60,7 +60,7 @@ def run(settings: Train, stop: int | None = None) -> None:
     """
     join(settings.coordinator, settings.processes, settings.process)
     if settings.batch % jax.device_count():
-        raise ValueError(
+        raise SettingsError(
             f"batch is {settings.batch}, but the sequences of a batch are dealt out to "
             f"{jax.device_count()} devices: choose a multiple of that"
         )
@@ -165,7 +165,7 @@ def first_state(settings: Train) -> TrainState:
     else:
         weights = load_weights(settings.weights)
         if not weights.normalise:
-            raise ValueError(
+            raise CheckpointError(
                 f"{settings.weights} expects tensors that are not normalised, training normalises "
                 "them: start from other weights, or from none"
             )
@@ -180,7 +180,7 @@ def _keys(settings: Train) -> list[jax.Array]:
         training, validation = jax.random.split(jax.random.key(settings.seed + 1))
         return [training, *jax.random.split(validation, VALIDATION)]
 
-    return jax.jit(keys, out_shardings=shared())()  # devices of others take keys in no other way
+    return jax.jit(keys, out_shardings=sharding())()  # devices of others take keys in no other way
 
 
 def sources_of(settings: Train, done: int) -> tuple[Iterator, list[Callable[[], Simulation]]]:
@@ -204,7 +204,7 @@ def sources_of(settings: Train, done: int) -> tuple[Iterator, list[Callable[[], 
 
     def load(count, seed):
         pictures = load_textures(settings.images, count, TEXTURE, seed, settings.procedural)
-        return everywhere(pictures)
+        return replicated(pictures)
 
     training, others = load(settings.textures, settings.seed), load(32, settings.seed + 1)
     key, *keys = _keys(settings)
@@ -220,14 +220,14 @@ def _dealt(data: Simulation) -> Simulation:
 
     def dealt(whole):
         whole = np.asarray(whole)
-        return jax.make_array_from_callback(whole.shape, shared(TIME_BATCH), whole.__getitem__)
+        return jax.make_array_from_callback(whole.shape, sharding(TIME_BATCH), whole.__getitem__)
 
     return jax.tree.map(dealt, data)
 
 
 def _check_finite(terms: dict[str, float], state: TrainState, folder: Path) -> None:
     if not np.isfinite(terms["loss"]) and int(state.optimiser.notfinite_count) >= 10:
-        raise ValueError(
+        raise FirenetError(
             f"{folder}: ten steps in a row had no finite gradient, training has diverged: start "
             "again with a smaller --learning-rate"
         )

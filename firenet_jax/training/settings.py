@@ -13,7 +13,9 @@ from typing import Annotated, Literal
 import tyro
 
 from firenet_jax.devices import check_processes
-from firenet_jax.simulation.scenes import SceneSettings, check_range, check_seed
+from firenet_jax.errors import SettingsError
+from firenet_jax.settings import check_range, check_seed
+from firenet_jax.simulation.scenes import SceneSettings
 from firenet_jax.simulation.sensor import FAULTY, SensorSettings, check_rare
 from firenet_jax.training.batches import Augment
 from firenet_jax.training.losses import DISTANCES, Loss
@@ -116,27 +118,31 @@ class Train:
         )
         for name in positive:
             if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}, but must be more than 0")
+                raise SettingsError(f"{name} is {getattr(self, name)}, but must be more than 0")
         if not self.loss.l0 < self.windows <= self.loss.L + 1:
-            raise ValueError(
+            raise SettingsError(
                 f"windows is {self.windows}, but the loss is over more than {self.loss.l0} and at "
                 f"most {self.loss.L + 1} of them"
             )
         if not any(getattr(self.loss, name) for name in DISTANCES):
-            raise ValueError(f"no distance has a weight: pass one of {', '.join(DISTANCES)}")
+            raise SettingsError(f"no distance has a weight: pass one of {', '.join(DISTANCES)}")
         if self.crop < SMALLEST:
-            raise ValueError(
+            raise SettingsError(
                 f"crop is {self.crop} pixels, but images smaller than {SMALLEST} cannot be judged"
             )
         check_range("motion", self.motion)
         check_rare(self.slow, self.swift)
         check_seed(self.seed)
         if not self.save_every >= 0:
-            raise ValueError(f"save_every is {self.save_every} seconds, but must be 0 or more")
+            raise SettingsError(f"save_every is {self.save_every} seconds, but must be 0 or more")
         if not 0 <= self.procedural <= 1:
-            raise ValueError(f"procedural is {self.procedural}, but is a part of the textures, 0-1")
+            raise SettingsError(
+                f"procedural is {self.procedural}, but is a part of the textures, 0-1"
+            )
         if not 0 <= warming_up(self) < self.steps:
-            raise ValueError(f"warmup is {self.warmup} steps of {self.steps}: use 0 or more, fewer")
+            raise SettingsError(
+                f"warmup is {self.warmup} steps of {self.steps}: use 0 or more, fewer"
+            )
         check_processes(self.coordinator, self.processes, self.process)
 
     @property

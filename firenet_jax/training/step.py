@@ -23,7 +23,7 @@ import optax
 import optax.contrib
 
 from firenet_jax.convolution import CONVOLVED
-from firenet_jax.devices import BATCH, EVERYWHERE, TIME_BATCH, everywhere, on_each_device, shared
+from firenet_jax.devices import BATCH, REPLICATED, TIME_BATCH, on_each_device, replicated, sharding
 from firenet_jax.evaluation import metrics
 from firenet_jax.network import State, initial_state, step
 from firenet_jax.simulation.scenes import SceneSettings
@@ -124,9 +124,9 @@ def initial_train_state(params: Any, settings: StepSettings, simulates: bool = T
         carried = jax.eval_shape(partial(_fresh, settings=settings), *setups)
         carried = carried if simulates else (None, carried[1])
         carried = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), carried)
-        carried = jax.device_put(carried, shared(BATCH))
+        carried = jax.device_put(carried, sharding(BATCH))
     state = params, optimiser(settings).init(params), np.int32(0)
-    return TrainState(*everywhere(state), carried)
+    return TrainState(*replicated(state), carried)
 
 
 # ---- Simulation
@@ -243,8 +243,8 @@ def loss_of(params, data: Simulation, state: State | None, warm, settings: StepS
     # A `warm` that is known, known it must stay: it is no argument of the program then.
     known = isinstance(warm, bool)
     function = partial(one_device, warm=warm) if known else one_device
-    specs = (EVERYWHERE, TIME_BATCH, BATCH) + (() if known else (BATCH,))
-    on_each = on_each_device(function, specs, (EVERYWHERE, (BATCH, TIME_BATCH)))
+    specs = (REPLICATED, TIME_BATCH, BATCH) + (() if known else (BATCH,))
+    on_each = on_each_device(function, specs, (REPLICATED, (BATCH, TIME_BATCH)))
     (loss, terms), (last, images) = on_each(params, data, state, *(() if known else (warm,)))
     return loss, (terms, last, images)
 
@@ -308,4 +308,4 @@ def validate(params, data: Simulation, settings: StepSettings):
         "ssim": metrics.ssim(shown, truths).mean(),
     }
     pictures = images[:, 0], data.images[:, 0], data.tensors[:, 0]
-    return scores, jax.lax.with_sharding_constraint(pictures, shared())
+    return scores, jax.lax.with_sharding_constraint(pictures, sharding())
