@@ -34,7 +34,8 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt  # noqa: E402
 
 from firenet_jax.commands.simulate import Simulate, sequence  # noqa: E402
-from firenet_jax.events import Events, RecordingError, concatenate  # noqa: E402
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, concatenate  # noqa: E402
 from firenet_jax.readers import open_recording  # noqa: E402
 from firenet_jax.simulation.sensor import FAULTY, SensorSettings  # noqa: E402
 from firenet_jax.simulation.textures import load_textures  # noqa: E402

@@ -74,7 +74,9 @@ from firenet_jax.simulation.sensor import SensorSettings
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.tensors import pack
 from firenet_jax.training.losses import Loss
-from firenet_jax.training.run import TEXTURE, Train, initial_train_state, simulated, train_step
+from firenet_jax.training.run import first_state
+from firenet_jax.training.settings import Train
+from firenet_jax.training.step import TEXTURE, simulated, train_step
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt  # noqa: E402
@@ -289,16 +291,16 @@ def training_makers(crop: int) -> Makers:
     """Each takes a training step on the same data and returns its loss and gradient's norm."""
     settings = replace(TRAIN, crop=crop)
     textures = load_textures(None, 16, TEXTURE)
-    data = simulated(jax.random.key(0), jnp.asarray(textures), settings)
+    data = simulated(jax.random.key(0), jnp.asarray(textures), settings.step_settings)
     params = initial_params(jax.random.key(settings.seed))
 
     def ours(bfloat16):
         asked = replace(settings, bfloat16=bfloat16)
-        state = initial_train_state(asked)
+        state = first_state(asked)
 
         def run():
             nonlocal state
-            state, terms = train_step(state, data, asked)
+            state, terms = train_step(state, data, asked.step_settings)
             return {name: float(terms[name]) for name in ("loss", "gradient")}
 
         return run
@@ -341,15 +343,15 @@ def simulation_share(runs: int) -> list[dict]:
 
 
 def share(name: str, settings: Train, textures: jax.Array, runs: int) -> dict:
-    key = jax.random.key(1)
-    data = simulated(key, textures, settings)
+    key, of_step = jax.random.key(1), settings.step_settings
+    data = simulated(key, textures, of_step)
 
     def stepping(source):
-        state = initial_train_state(settings)
+        state = first_state(settings)
 
         def run():
             nonlocal state
-            state, terms = train_step(state, source, settings)
+            state, terms = train_step(state, source, of_step)
             return jax.block_until_ready(terms)
 
         return run
@@ -357,7 +359,9 @@ def share(name: str, settings: Train, textures: jax.Array, runs: int) -> dict:
     methods = {
         "whole step": stepping((key, textures)),
         "step on data that are there": stepping(data),
-        "simulation alone": lambda: jax.block_until_ready(simulated(key, textures, settings)),
+        "simulation alone": lambda: jax.block_until_ready(
+            simulated(key, textures, settings.step_settings)
+        ),
     }
     print(f"\n{name}")
     rows = table(interleaved(methods, runs), "whole step")

@@ -17,15 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firenet_jax.network import BINS, CHANNELS, Weights
+from firenet_jax.errors import CheckpointError
+from firenet_jax.events import BINS
+from firenet_jax.network import CHANNELS, Weights
 from firenet_jax.storage.files import check_readable
-from firenet_jax.storage.pytorch_file import (
-    CheckpointError,
-    identify,
-    read_state_dict,
-    refuse_unused,
-    take,
-)
+from firenet_jax.storage.pytorch_file import identify, read_state_dict, refuse_unused, take
 
 FORMAT = 1
 MAX_BYTES = 2**20  # six times a whole file: what claims more is no FireNet and is not read

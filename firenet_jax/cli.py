@@ -12,6 +12,8 @@ import logging
 import os
 import sys
 
+from firenet_jax.errors import FirenetError
+
 # name: (module, settings, what it does)
 COMMANDS = {
     "demo": (
@@ -31,7 +33,7 @@ COMMANDS = {
         "Simulate",
         "training data, or a video file -> events",
     ),
-    "train": ("firenet_jax.training.run", "Train", "simulated sequences -> weights"),
+    "train": ("firenet_jax.commands.train", "Train", "simulated sequences -> weights"),
     "evaluate": (
         "firenet_jax.commands.evaluate",
         "Evaluate",
@@ -45,6 +47,14 @@ COMMANDS = {
     ),
 }
 
+# What only some commands need: the library, and the extra of this package that brings it.
+EXTRAS = {
+    "optax": "train",
+    "orbax": "train",
+    "grain": "train",
+    "tensorboardX": "train",
+    "skimage": "evaluate",
+}
 
 # Options of the original program (rpg_e2vid) and what does the same here.
 FORMER = {
@@ -90,6 +100,10 @@ def _return_freed_memory() -> None:
             ctypes.CDLL(None).mallopt(-3, 1 << 22)  # M_MMAP_THRESHOLD
 
 
+REPORT = (
+    "firenet: this is a fault of firenet, not of yours: please report it, with the command and all "
+    "these lines"
+)
 HUGE_PAGES = "glibc.malloc.hugetlb=1"
 
 
@@ -107,8 +121,30 @@ def program() -> int:
     return main()
 
 
+def sentence(error: Exception, command: str) -> str | None:
+    """What a person is told who can put it right; None where the fault is this package's."""
+    if isinstance(error, ModuleNotFoundError):
+        library = (error.name or "").partition(".")[0]
+        if library in EXTRAS:
+            return (
+                f"firenet {command} needs {library}, which is not installed: "
+                f'pip install "firenet-jax[{EXTRAS[library]}]"'
+            )
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+        return "not enough memory: ask for a smaller sensor, chunk, crop or batch"
+    if isinstance(error, PermissionError) and error.filename:
+        from firenet_jax.storage.files import forbidden
+
+        return forbidden(error.filename)
+    return str(error) if isinstance(error, (FirenetError, OSError)) else None
+
+
 def main(arguments: list[str] | None = None) -> int:
-    """Runs one command; returns the exit code. Errors of a user's making are one sentence."""
+    """Runs one command; returns the exit code.
+
+    What a user can put right (`FirenetError`), the system's refusals (OSError) and a lack of memory
+    are one sentence. Anything else is a fault of this package and shows its traceback.
+    """
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage())
@@ -123,7 +159,6 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
 
     from firenet_jax.commands import options
-    from firenet_jax.storage.files import forbidden
 
     logging.basicConfig(format="firenet: %(message)s", level=logging.WARNING)
     _return_freed_memory()
@@ -144,15 +179,13 @@ def main(arguments: list[str] | None = None) -> int:
         goes_on = str(error) or "a folder of pictures or sequences goes on when run again"
         print(f"firenet: interrupted; {goes_on}", file=sys.stderr)
         return 130
-    except (ValueError, OSError, MemoryError, RuntimeError) as error:
-        no_room = isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
-        if os.environ.get("FIRENET_DEBUG") or (isinstance(error, RuntimeError) and not no_room):
+    except Exception as error:
+        said = sentence(error, name)
+        if said is None:
+            error.add_note(REPORT)
+        if said is None or os.environ.get("FIRENET_DEBUG"):
             raise
-        if no_room:
-            error = "not enough memory: ask for a smaller sensor, chunk, crop or batch"
-        elif isinstance(error, PermissionError) and error.filename:
-            error = forbidden(error.filename)
-        print(f"firenet: error: {error}", file=sys.stderr)
+        print(f"firenet: error: {said}", file=sys.stderr)
         return 1
     return 0
 

@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from firenet_jax.errors import SettingsError
+
 CORNERS = ((0, 0), (0, 1), (1, 1))  # of red, green and blue: row, column
 
 # Linear sRGB -> CIE XYZ (IEC 61966-2-1), and XYZ of its white (D65).
@@ -26,7 +28,7 @@ WHITE = XYZ.sum(1)
 def check_sides(height: int, width: int) -> None:
     """Raises ValueError unless both sides hold the mosaic a whole number of times."""
     if height % 2 or width % 2:
-        raise ValueError(
+        raise SettingsError(
             f"{width}x{height} cannot be a colour sensor, whose mosaic has even sides: leave out "
             "--color, or give the --sensor-size"
         )

@@ -6,7 +6,6 @@ seconds lose microseconds after 16 s. A recording is a stream of `Events` chunks
 """
 
 import bisect
-import logging
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,14 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-logger = logging.getLogger("firenet_jax")
+from firenet_jax.errors import RecordingError, logger  # noqa: F401
+from firenet_jax.settings import LONGEST_SIDE, parse_size  # noqa: F401
 
+BINS = 5  # of an event tensor: what a window is split into along time (Eq. 1)
 LATEST = 2**53  # microseconds, 285 years: float64 seconds lose microseconds beyond
-REACH = 2**15  # pixels of a sensor's side at most: coordinates are int16
-
-
-class RecordingError(ValueError):
-    """A recording cannot be used; the message is one sentence: file, place, found, what to do."""
+REACH = LONGEST_SIDE
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -95,6 +92,8 @@ class Frames(NamedTuple):
 
     times: np.ndarray  # (F,) int64, microseconds, on the clock of the events
     read: Callable[[int], np.ndarray]  # i -> (H, W) uint8
+    # i -> (2, H, W), x then y, pixels per second up to this picture; None where a file has none
+    flow: Callable[[int], np.ndarray | None] | None = None
 
 
 class Triggers(NamedTuple):
@@ -299,15 +298,3 @@ def until_damage(chunks: Iterable[Events]) -> Iterator[Events]:
     except RecordingError:
         if not seen:
             raise
-
-
-def parse_size(text: str | None) -> tuple[int, int] | None:
-    """ "240x180" -> (height, width) = (180, 240)."""
-    if text is None:
-        return None
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise ValueError(f"sensor size {text!r}: expected WIDTHxHEIGHT, such as 240x180")
-    if max(int(width), int(height)) > REACH:
-        raise ValueError(f"sensor size {text}: a side is at most {REACH} pixels")
-    return int(height), int(width)

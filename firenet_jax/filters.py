@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import median_filter
 
-from firenet_jax.events import LATEST, Events, Recording, RecordingError, until_damage
+from firenet_jax.errors import RecordingError, SettingsError
+from firenet_jax.events import LATEST, Events, Recording, until_damage
 from firenet_jax.storage.files import check_readable
 
 
@@ -18,9 +19,9 @@ def check_span(start: float | None, stop: float | None) -> None:
     """Raises ValueError unless these seconds, None for no bound, are a part of a recording."""
     for name, value in (("start", start), ("stop", stop)):
         if value is not None and not abs(value) < LATEST / 1e6:
-            raise ValueError(f"{name} is {value} s, but must be a time: leave it out for none")
+            raise SettingsError(f"{name} is {value} s, but must be a time: leave it out for none")
     if stop is not None and stop <= (start or 0):
-        raise ValueError(f"stop is {stop} s, but must come after the start")
+        raise SettingsError(f"stop is {stop} s, but must come after the start")
 
 
 def between(chunks: Iterable[Events], start: float | None, stop: float | None) -> Iterator[Events]:

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 
 from firenet_jax.convolution import layer
+from firenet_jax.events import BINS
 
 CHANNELS = 16
-BINS = 5
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["params"], meta_fields=["normalise"])

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import norm
 
+from firenet_jax.errors import SettingsError
+
 HISTORY = 11  # images whose range the automatic one is the median of
 
 
@@ -33,7 +35,7 @@ class Display:
     def __post_init__(self):
         for name in ("unsharp", "bilateral"):
             if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} is {getattr(self, name)}, but must be 0 or more")
+                raise SettingsError(f"{name} is {getattr(self, name)}, but must be 0 or more")
 
 
 class DisplayState(NamedTuple):

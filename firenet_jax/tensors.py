@@ -23,10 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.devices import BATCH, TIME_BATCH
-from firenet_jax.events import Events, Recording
+from firenet_jax.errors import SettingsError
+from firenet_jax.events import BINS, Events, Recording
 from firenet_jax.windows import Windows, cut
-
-BINS = 5
 
 # A flat list of events is padded to one of these sizes: at most 8 times too long, at a few ns
 # for each event too many, against a compilation of seconds for each new size; from a million on
@@ -84,7 +83,7 @@ def pack(
     if counts.sum() > size:
         raise ValueError(f"{counts.sum()} events do not fit into a list of {size}")
     if len(flat) >= 2**15:
-        raise ValueError(
+        raise SettingsError(
             f"a chunk of {shape[0]} x {shape[1]} windows is too large: ask for a smaller chunk or "
             f"batch, fewer than {2**15} windows at once"
         )
@@ -183,7 +182,7 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
     windows, plane = steps * batch, height * width
     even, odd = (BINS + 1) // 2, BINS // 2  # how many bins have even numbers and odd ones
     if BINS * windows * plane >= 2**31:
-        raise ValueError(
+        raise SettingsError(
             f"{windows} windows of {width}x{height} are too many for one chunk: use a smaller one"
         )
 

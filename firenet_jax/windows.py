@@ -14,14 +14,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import tyro
 
-from firenet_jax.events import (
-    Events,
-    Recording,
-    RecordingError,
-    concatenate,
-    counted,
-    logger,
-)
+from firenet_jax.errors import RecordingError, SettingsError, logger
+from firenet_jax.events import Events, Recording, concatenate, counted
 
 APART = 3_600_000_000  # microseconds between events of one clock, or events and frames, at most
 MOST = 2**31 - 1
@@ -146,13 +140,15 @@ def cut(
     if windows.duration is not None:
         step = windows.duration if windows.step is None else windows.step
         if step > windows.duration:
-            raise ValueError(f"step of {step} ms is longer than the window, {windows.duration} ms")
+            raise SettingsError(
+                f"step of {step} ms is longer than the window, {windows.duration} ms"
+            )
         spans = partial(_grid_spans, windows.duration, step)
         return _by_time(recording.path, chunks, begin, spans)
     count = windows.count(recording.pixels)
     step = count if windows.step is None else int(windows.step)
     if step > count:
-        raise ValueError(f"step of {step} events is longer than the window, {count} events")
+        raise SettingsError(f"step of {step} events is longer than the window, {count} events")
     warn_if_unusual(count, recording.pixels)
     if windows.longest is not None:
         return _by_count_or_time(chunks, count, round(1000 * windows.longest))

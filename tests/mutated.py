@@ -4,7 +4,7 @@
 
 Input number n is a function of the seed, n and `--only`: `--first N --count 1` runs one again.
 Inputs are small files of every format, written here, and with FIRENET_RECORDINGS and
-FIRENET_REFERENCE set real ones, or their beginnings. Refusing is a ValueError or OSError whose
+FIRENET_REFERENCE set real ones, or their beginnings. Refusing is a FirenetError or OSError whose
 message is one line; anything else is a fault of ours: another exception, a process that ends
 (inputs are read in a worker, which is started again), more than 8 GB, more than a minute.
 """
@@ -22,6 +22,8 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
+
+from firenet_jax.errors import FirenetError
 
 SLOW = 60.0  # seconds
 AT_ONCE = 500  # inputs that one worker reads: libraries keep a little of what they have opened
@@ -212,7 +214,7 @@ def read(name: str, path: Path) -> None:
     from firenet_jax.simulation import textures
     from firenet_jax.storage.files import read_arrays
     from firenet_jax.training import batches
-    from firenet_jax.training import run as train
+    from firenet_jax.training import log as training_log
 
     if name == "hot.txt":
         read_hot_pixels(path, 20, 24)
@@ -233,8 +235,8 @@ def read(name: str, path: Path) -> None:
     elif name.startswith("picture"):
         textures.load_textures(path.parent, 1, 32, 0)
     elif name == "log.jsonl":
-        log = train.Log.__new__(train.Log)
-        log.entries = [entry for entry in train._entries(path) if entry["step"] <= 100]
+        log = training_log.Log.__new__(training_log.Log)
+        log.entries = [entry for entry in training_log._entries(path) if entry["step"] <= 100]
         f"{log.best():.4f}"
     else:
         recording = open_recording(path)
@@ -265,11 +267,9 @@ def one(seed: int, number: int, whole: dict[str, Path], folder: Path) -> tuple[s
     changed.write_bytes(mutated(rng, changed.read_bytes()))
     try:
         read(name, target)
-    except (ValueError, OSError) as error:
-        if len(str(error).splitlines()) == 1 and type(error).__name__ != "UnicodeDecodeError":
-            kind = type(error).__module__.partition(".")[0]
-            ours = kind in ("firenet_jax", "builtins")
-            return name, "refused" if ours else f"FAULT: {type(error).__name__}: {error}"
+    except (FirenetError, OSError) as error:
+        if len(str(error).splitlines()) == 1:
+            return name, "refused"
         return name, f"FAULT: {type(error).__name__}: {str(error)[:300]!r}"
     except BaseException as error:
         return name, f"FAULT: {type(error).__name__}: {str(error)[:300]!r}"

@@ -16,7 +16,7 @@ from skimage.metrics import structural_similarity
 from firenet_jax import cli
 from firenet_jax.checkpoint import save_weights
 from firenet_jax.commands import evaluate, options
-from firenet_jax.commands.evaluate import Evaluate, interval, plan, read_flow, run
+from firenet_jax.commands.evaluate import Evaluate, displacement, interval, plan, run
 from firenet_jax.commands.simulate import Picture, write_sequence
 from firenet_jax.evaluation import comparison, methods, metrics
 from firenet_jax.evaluation.baselines import e2vid
@@ -576,7 +576,7 @@ def test_flow_is_not_known_where_frames_were_left_out(tmp_path):
     gaps = np.diff(found.numbers)
     assert {1, 2} <= set(gaps.tolist())
     for place, gap in enumerate(gaps, 1):
-        assert (read_flow(found, place) is None) == (gap > 1)
+        assert (displacement(found, place) is None) == (gap > 1)
 
 
 def test_temporal_errors_do_not_depend_on_where_batches_end(folder, tmp_path, monkeypatch):

@@ -4,7 +4,8 @@ from test_tensors import random_events
 from test_windows import recording_of
 
 from firenet_jax import filters
-from firenet_jax.events import Events, Recording, RecordingError, concatenate
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, Recording, concatenate
 
 
 def test_between_counts_seconds_from_the_first_event():

@@ -17,7 +17,8 @@ import pytest
 from PIL import Image
 
 from firenet_jax import cli
-from firenet_jax.events import Events, Recording, RecordingError, concatenate
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, Recording, concatenate
 from firenet_jax.live import sources
 from firenet_jax.live.engine import Arrived, Figures, Waiting, pictures, sound, windows
 from firenet_jax.live.page import Board, serve

@@ -17,7 +17,7 @@ from processes import finish, start
 from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.commands import reconstruct as pipeline
 from firenet_jax.commands.reconstruct import Reconstruct, describe, plan, run
-from firenet_jax.events import RecordingError
+from firenet_jax.errors import RecordingError
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording

@@ -22,7 +22,8 @@ import pytest
 from PIL import Image
 
 from firenet_jax import readers
-from firenet_jax.events import Events, RecordingError, _out_of_order, checked, concatenate
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, _out_of_order, checked, concatenate
 from firenet_jax.readers import (
     aedat4,
     camera,

@@ -1,3 +1,4 @@
+import dataclasses
 import itertools
 import json
 import signal
@@ -22,8 +23,12 @@ from firenet_jax.simulation.sensor import FAULTY, simulate, window_bounds
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage.files import locked
 from firenet_jax.training import run as train
+from firenet_jax.training import settings as train_settings
+from firenet_jax.training import step as train_steps
+from firenet_jax.training.log import Log
 from firenet_jax.training.losses import Loss
-from firenet_jax.training.run import Log, Train, images_of, initial_train_state, run, train_step
+from firenet_jax.training.run import Train, first_state, run
+from firenet_jax.training.step import images_of, train_step
 
 # Few terms compile sooner; those left out are tested in test_losses.py, and below by heart.
 SHORT = Loss(l1=1, nlpd=0, haarpsi=0, l0=1)
@@ -141,25 +146,61 @@ def test_learns_one_batch_by_heart(tmp_path):
     """The same sequences again and again: the loss must fall a long way."""
     settings = tiny(tmp_path, steps=60, warmup=5, learning_rate=3e-3, loss=Loss(l0=1))
     textures = jnp.asarray(load_textures(None, 4, 64, 0, procedural=1.0))
-    state, key, seen = initial_train_state(settings), jax.random.key(0), []
+    state, key, seen = first_state(settings), jax.random.key(0), []
     train_step.clear_cache()
     for _ in range(60):
         step = state.step
-        state, terms = train_step(state._replace(step=jnp.int32(0)), (key, textures), settings)
+        state, terms = train_step(
+            state._replace(step=jnp.int32(0)), (key, textures), settings.step_settings
+        )
         state = state._replace(step=step + 1)
         seen.append(float(terms["loss"]))
     assert np.mean(seen[-5:]) < 0.6 * np.mean(seen[:5])
     assert train_step._cache_size() == 1
 
 
+def test_runs_that_differ_in_paths_compile_one_step(tmp_path, monkeypatch):
+    """Tracing comes before compiling: what is not traced anew is not compiled anew."""
+    traced, loss_of = [], train_steps.loss_of
+
+    def counted(*args):
+        traced.append(args)
+        return loss_of(*args)
+
+    monkeypatch.setattr(train_steps, "loss_of", counted)
+    train_step.clear_cache()
+    state, source = first_state(tiny(tmp_path)), (jax.random.key(0), jnp.zeros((4, 64, 64)))
+    for asked in (
+        tiny(tmp_path / "one"),
+        tiny(tmp_path / "two", images=tmp_path, weights=tmp_path, seed=3, save_every=9.0),
+    ):
+        train_step.eval_shape(state, source, asked.step_settings)
+    assert len(traced) == 1
+    train_step.eval_shape(state, source, tiny(tmp_path, clip=0.5).step_settings)
+    assert len(traced) == 2  # the count counts
+    train_step.clear_cache()
+
+
+def test_nothing_that_a_compiled_step_depends_on_is_a_path(tmp_path):
+    def leaves(value):
+        if dataclasses.is_dataclass(value):
+            return [
+                leaf for f in dataclasses.fields(value) for leaf in leaves(getattr(value, f.name))
+            ]
+        return [value]
+
+    assert not any(isinstance(leaf, Path) for leaf in leaves(tiny(tmp_path).step_settings))
+
+
 def test_sequences_of_a_batch_are_of_different_ages_and_go_on_where_they_were(tmp_path):
-    settings = tiny(tmp_path, chain=4, sensor=replace(FAULTY, mid_recording=True))
+    asked = tiny(tmp_path, chain=4, sensor=replace(FAULTY, mid_recording=True))
+    settings = asked.step_settings
     textures, key = jnp.asarray(load_textures(None, 4, 64, 0, procedural=1.0)), jax.random.key(1)
-    lengths = train._lengths(settings)
+    lengths = train_steps._lengths(settings)
     assert lengths.tolist() == [2, 4]
 
-    make = jax.jit(partial(train._simulated, settings=settings))
-    state, seen, warm = initial_train_state(settings), [], []
+    make = jax.jit(partial(train_steps._simulated, settings=settings))
+    state, seen, warm = first_state(asked), [], []
     for step in range(4):
         data, carried, known = make(key, textures, state=state._replace(step=jnp.int32(step)))
         state = state._replace(carried=carried)
@@ -169,7 +210,9 @@ def test_sequences_of_a_batch_are_of_different_ages_and_go_on_where_they_were(tm
 
     def whole(number, windows):
         numbers = jnp.full(2, number, jnp.int32)
-        *both, durations = train._setups(key, textures, settings, jnp.asarray(lengths), numbers)
+        *both, durations = train_steps._setups(
+            key, textures, settings, jnp.asarray(lengths), numbers
+        )
         bounds = window_bounds(durations, windows)
         return simulate(*both, bounds, height=32, width=32, renderings=5)[1].tensors
 
@@ -182,11 +225,13 @@ def test_sequences_of_a_batch_are_of_different_ages_and_go_on_where_they_were(tm
 
 def test_remat_and_bfloat16_change_little(tmp_path):
     settings = tiny(tmp_path)
-    params = initial_train_state(settings).params
+    params = first_state(settings).params
     tensors = jax.random.normal(jax.random.key(1), (3, 1, 16, 16, 5))
 
     def gradient(settings):
-        return jax.grad(lambda params: (images_of(params, tensors, settings)[1] ** 2).sum())(params)
+        return jax.grad(
+            lambda params: (images_of(params, tensors, settings.step_settings)[1] ** 2).sum()
+        )(params)
 
     exact, again = gradient(settings), gradient(replace(settings, remat=True))
     rough = gradient(replace(settings, bfloat16=True))
@@ -253,7 +298,7 @@ def test_another_process_never_sees_half_of_the_settings(tmp_path, monkeypatch):
     def write_with_a_look_in_between(path, text, **how):
         write(path, text[:10], **how)
         with monkeypatch.context() as other:
-            other.setattr(train, "_first", lambda: False)
+            other.setattr(train, "is_first", lambda: False)
             train._check_settings(tmp_path, settings)
         write(path, text, **how)
 
@@ -266,7 +311,7 @@ def test_weights_that_expect_other_tensors_are_refused(tmp_path):
     path = tmp_path / "plus.npz"
     save_weights(path, Weights(initial_params(jax.random.key(0)), normalise=False))
     with pytest.raises(ValueError, match="plus.npz expects tensors that are not normalised"):
-        initial_train_state(tiny(tmp_path, weights=path))
+        first_state(tiny(tmp_path, weights=path))
 
 
 def test_the_log_forgets_what_comes_after_the_checkpoint(tmp_path):
@@ -308,10 +353,10 @@ def test_a_damaged_log_keeps_what_is_whole(tmp_path):
 
 
 def test_a_short_run_warms_up_in_fewer_steps(tmp_path):
-    assert train.warming_up(Train(tmp_path, steps=30)) == 6
-    assert train.warming_up(Train(tmp_path)) == 200
-    assert train.warming_up(Train(tmp_path, steps=1)) == 0
-    assert train.warming_up(Train(tmp_path, steps=30, warmup=20)) == 20
+    assert train_settings.warming_up(Train(tmp_path, steps=30)) == 6
+    assert train_settings.warming_up(Train(tmp_path)) == 200
+    assert train_settings.warming_up(Train(tmp_path, steps=1)) == 0
+    assert train_settings.warming_up(Train(tmp_path, steps=30, warmup=20)) == 20
 
 
 @pytest.fixture
@@ -402,19 +447,19 @@ def test_trains_on_files_and_resumes(tmp_path, chain):
     run(settings)
     assert [step for step, kind, _ in losses(tmp_path / "whole") if kind == "train"] == [1, 2, 3, 4]
 
-    state, sources = initial_train_state(settings), train.sources_of(settings, 0)[0]
+    state, sources = first_state(settings), train.sources_of(settings, 0)[0]
     seen = []
     for number in range(4):
         if number == 3:
             sources = train.sources_of(settings, 3)[0]
-        state, terms = train_step(state, next(sources), settings)
+        state, terms = train_step(state, next(sources), settings.step_settings)
         seen.append(float(terms["loss"]))
     assert seen == [loss for _, kind, loss in losses(tmp_path / "whole") if kind == "train"]
 
 
 @pytest.mark.parametrize("name", ["muon", "adam"])
 def test_large_gradients_are_scaled_down_and_those_that_are_not_finite_left_out(tmp_path, name):
-    update = train.optimiser(tiny(tmp_path, optimiser=name, clip=0.5, warmup=0))
+    update = train_steps.optimiser(tiny(tmp_path, optimiser=name, clip=0.5, warmup=0).step_settings)
     params = {"kernel": jnp.ones((3, 3, 2, 4)), "bias": jnp.ones(4)}
     before = update.init(params)
     _, after = update.update(jax.tree.map(lambda p: 100 * p, params), before, params)

@@ -4,7 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firenet_jax.events import Events, Frames, Recording, RecordingError
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, Frames, Recording
 from firenet_jax.windows import Windows, _grid_spans, cut, in_words, usual
 
 

@@ -1,5 +1,5 @@
 """One module a command of `firenet`, named as the command: its settings, and `run(settings)`.
 
 The settings are a frozen dataclass, of which the command line is made (`cli`). No other room
-imports this one. `train` is the exception: it is `training.run`.
+imports this one.
 """

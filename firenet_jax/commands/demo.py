@@ -18,12 +18,13 @@ import tyro
 from PIL import Image, ImageDraw, ImageFont
 
 from firenet_jax.checkpoint import load_weights
+from firenet_jax.errors import SettingsError
 from firenet_jax.evaluation.metrics import mse, ssim, temporal_error
-from firenet_jax.events import parse_size
 from firenet_jax.network import Weights, initial_state
 from firenet_jax.pictures import Display, display, event_pictures, initial_display_state
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.simulation.scenes import Scene, SceneSettings, check_seed, random_scene
+from firenet_jax.settings import check_seed, parse_size
+from firenet_jax.simulation.scenes import Scene, SceneSettings, random_scene
 from firenet_jax.simulation.sensor import FAULTY, Sensor, SensorSettings, random_sensor, simulate
 from firenet_jax.simulation.textures import HELD_OUT, load_textures, photographs
 from firenet_jax.storage.overlap import ahead
@@ -66,15 +67,17 @@ class Demo:
 
     def __post_init__(self):
         if not 0 < self.seconds <= 60:
-            raise ValueError(f"seconds is {self.seconds}, but must be more than 0 and up to 60")
+            raise SettingsError(f"seconds is {self.seconds}, but must be more than 0 and up to 60")
         if not 1 <= self.fps <= 1000:
-            raise ValueError(f"fps is {self.fps}, but must be between 1 and 1000")
+            raise SettingsError(f"fps is {self.fps}, but must be between 1 and 1000")
         if self.seconds * self.fps < 1:
-            raise ValueError(f"{self.seconds} s at {self.fps} pictures per second hold no picture")
+            raise SettingsError(
+                f"{self.seconds} s at {self.fps} pictures per second hold no picture"
+            )
         check_seed(self.seed)
         height, width = parse_size(self.sensor_size)
         if min(height, width) < 16:
-            raise ValueError(f"a sensor of {width}x{height}: expected 16x16 or more")
+            raise SettingsError(f"a sensor of {width}x{height}: expected 16x16 or more")
 
 
 class Shown(NamedTuple):

@@ -25,18 +25,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import h5py
 import numpy as np
 import tyro
 from tqdm import tqdm
 
 from firenet_jax.commands import options
+from firenet_jax.errors import OutputError, RecordingError, SettingsError, logger
 from firenet_jax.evaluation import lpips, report
 from firenet_jax.evaluation.comparison import (
     BATCH,
     Comparison,
     Gap,
-    Numbers,
+    Measurements,
     Pictures,
     Plan,
     matched,
@@ -44,24 +44,15 @@ from firenet_jax.evaluation.comparison import (
 )
 from firenet_jax.evaluation.equalise import Kind, equalise
 from firenet_jax.evaluation.methods import NAMES, Method, Missing, digest, load
-from firenet_jax.evaluation.report import METRICS
-from firenet_jax.events import Frames, Recording, RecordingError, logger, parse_size
+from firenet_jax.evaluation.results import METRICS, Measured, mean, summary
+from firenet_jax.events import Frames, Recording
 from firenet_jax.filters import check_span
 from firenet_jax.readers import FORMATS, open_recording
-from firenet_jax.readers.hdf5 import opened
-from firenet_jax.simulation.scenes import check_seed
-from firenet_jax.storage.files import (
-    OutputError,
-    alone_in,
-    differences,
-    identity,
-    named,
-    read_arrays,
-    write_arrays,
-    write_text,
-)
+from firenet_jax.settings import check_seed, parse_size
+from firenet_jax.storage.files import identity, named, read_arrays, write_arrays, write_text
 from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import bar
+from firenet_jax.storage.runs import alone_in, check_same, differences, make_folder, read_record
 from firenet_jax.storage.video import write_video
 from firenet_jax.windows import Window, Windows, cut
 
@@ -142,20 +133,22 @@ class Evaluate:
 
     def __post_init__(self):
         if not self.data:
-            raise ValueError(
+            raise SettingsError(
                 "no data: name one or more recordings, or folders of them, before the options"
             )
         if not self.method_names:
-            raise ValueError(f"no methods: choose from {', '.join(NAMES)}")
+            raise SettingsError(f"no methods: choose from {', '.join(NAMES)}")
         Windows(events=self.events, duration=self.duration)  # refuses numbers that cannot be
         if not 0 < self.keep_ratio <= 1:
-            raise ValueError(f"keep ratio is {self.keep_ratio}, but is a share, 0 to 1")
+            raise SettingsError(f"keep ratio is {self.keep_ratio}, but is a share, 0 to 1")
         if self.keep_ratio < 1 and not self.between_frames:
-            raise ValueError("keep ratio thins out frames: it varies windows between frames only")
+            raise SettingsError(
+                "keep ratio thins out frames: it varies windows between frames only"
+            )
         for name in ("warm_up", "tolerance"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
-                raise ValueError(f"{name} is {value}, but must be 0 or more")
+                raise SettingsError(f"{name} is {value}, but must be 0 or more")
         check_seed(self.seed)
         check_span(self.start, self.stop)
         parse_size(self.sensor_size)
@@ -215,22 +208,7 @@ def run(settings: Evaluate) -> dict:
             except (Gap, RecordingError) as error:
                 logger.warning("%s: %s", recording.path, error)
                 gaps = {(name, method.name): str(error) for method in methods} | gaps
-        work = [key for key in records if key not in done and key not in gaps]
-        by_name = {method.name: method for method in methods}
-        total = sum(plans[name].last for name, _ in work)
-        with bar(total, "frames", smoothing=0.1) as progress:
-            for name, method in work:
-                progress.set_postfix_str(f"{name}, {method}")
-                try:
-                    found, pictures = evaluate(
-                        plans[name], by_name[method], settings, learned, progress
-                    )
-                except (Gap, RecordingError) as error:
-                    logger.warning("%s, %s: %s", name, method, error)
-                    gaps[name, method] = str(error)
-                    continue
-                save(result_file(settings, name, method), records[name, method], found, pictures)
-                done[name, method] = found
+        compute(settings, records, plans, methods, learned, done, gaps)
         if not any(key in done for key in records):
             reason = next(iter(gaps.items()), (("", ""), "no method can run"))
             raise RecordingError(f"nothing can be evaluated: {' / '.join(reason[0])}: {reason[1]}")
@@ -238,6 +216,34 @@ def run(settings: Evaluate) -> dict:
         results = summarise(settings, shared, plans, recordings, methods, done, gaps)
         write_all(settings, results, plans, [key for key in records if key in done])
         return results
+
+
+def compute(
+    settings: Evaluate,
+    records: dict[tuple[str, str], dict],
+    plans: dict[str, Plan],
+    methods: list[Method | Missing],
+    learned: lpips.Lpips | None,
+    done: dict[tuple[str, str], Measured],
+    gaps: dict[tuple[str, str], str],
+) -> None:
+    """What is neither done nor a gap is computed, written, and added to one of them."""
+    work = [key for key in records if key not in done and key not in gaps]
+    by_name = {method.name: method for method in methods}
+    total = sum(plans[name].last for name, _ in work)
+    with bar(total, "frames", smoothing=0.1) as progress:
+        for name, method in work:
+            progress.set_postfix_str(f"{name}, {method}")
+            try:
+                found, pictures = evaluate(
+                    plans[name], by_name[method], settings, learned, progress
+                )
+            except (Gap, RecordingError) as error:
+                logger.warning("%s, %s: %s", name, method, error)
+                gaps[name, method] = str(error)
+                continue
+            save(result_file(settings, name, method), records[name, method], found, pictures)
+            done[name, method] = found
 
 
 # ---- Data
@@ -353,21 +359,15 @@ def windows_of(plan: Plan, settings: Evaluate) -> Iterator[Window]:
     return cut(recording, settings.windows, filter(len, later), plan.begin)
 
 
-def read_flow(plan: Plan, place: int) -> np.ndarray | None:
-    """(H, W, 2) pixels since the frame before, where the file has them (event_cnn_minimal's HDF5)
-    and the frame before is used too."""
-    path, number = plan.recording.path, int(plan.numbers[place])
-    if place == 0 or number != plan.numbers[place - 1] + 1 or not h5py.is_hdf5(path):
+def displacement(plan: Plan, place: int) -> np.ndarray | None:
+    """(H, W, 2) pixels since the frame before, where the recording has flow and the frame before
+    is used too."""
+    flow, number = plan.recording.frames.flow, int(plan.numbers[place])
+    if flow is None or place == 0 or number != plan.numbers[place - 1] + 1:
         return None
-    with opened(path) as file:
-        names = sorted(file.get("images", ()))
-        name = names[number].replace("image", "flow") if names else ""
-        if name not in file.get("flow", ()):
-            return None
-        velocity = file["flow"][name][()]
-    size = (2, plan.recording.height, plan.recording.width)
-    if velocity.shape != size:
-        raise RecordingError(f"{path}, {name}: has the shape {velocity.shape}, expected {size}")
+    velocity = flow(number)
+    if velocity is None:
+        return None
     seconds = np.float32(1e-6 * (plan.times[place] - plan.times[place - 1]))
     return seconds * np.moveaxis(velocity.astype(np.float32), 0, -1)
 
@@ -377,8 +377,8 @@ def read_flow(plan: Plan, place: int) -> np.ndarray | None:
 
 def evaluate(
     plan: Plan, method: Method, settings: Evaluate, learned: lpips.Lpips | None, progress: tqdm
-) -> tuple[dict, dict[str, np.ndarray]]:
-    """-> (numbers for each frame, ready for JSON; pictures (n, H, W) uint8 and their frames).
+) -> tuple[Measured, dict[str, np.ndarray]]:
+    """-> (numbers for each frame; pictures (n, H, W) uint8 and their frames).
 
     Raises Gap where no prediction counts or an image is not finite.
     """
@@ -400,7 +400,7 @@ def evaluate(
             progress.update(int(min(passed, plan.last)) - (progress.n - before))
             yield window.time, image
 
-    found, pictures = Numbers(plan, settings.equalise, learned), Pictures(plan)
+    found, pictures = Measurements(plan, settings.equalise, learned), Pictures(plan)
     waiting: list[Comparison] = []
     try:
         for place, image in matched(predictions(), plan.times, tolerance):
@@ -408,7 +408,7 @@ def evaluate(
                 truth = plan.recording.frames.read(int(plan.numbers[place]))
                 if truth.shape != image.shape:
                     raise Gap(f"frame {plan.numbers[place] + 1} is of another size: {truth.shape}")
-                waiting.append(Comparison(place, image, truth, read_flow(plan, place)))
+                waiting.append(Comparison(place, image, truth, displacement(plan, place)))
             if len(waiting) == BATCH:
                 pictures.add(waiting, found.add(waiting))
                 waiting = []
@@ -442,7 +442,9 @@ def result_file(settings: Evaluate, sequence: str, method: str) -> Path:
     return settings.output / "results" / sequence / f"{method}.json"
 
 
-def open_folder(settings: Evaluate, records: dict[tuple[str, str], dict]) -> dict:
+def open_folder(
+    settings: Evaluate, records: dict[tuple[str, str], dict]
+) -> dict[tuple[str, str], Measured]:
     """Makes the output folder; returns the results of an earlier run that belong to this one.
 
     Raises OutputError where a result was made by other settings, which `overwrite` replaces.
@@ -455,32 +457,29 @@ def open_folder(settings: Evaluate, records: dict[tuple[str, str], dict]) -> dic
         path = result_file(settings, *key)
         if not (path.is_file() and path.with_suffix(".npz").is_file()):
             continue
+        saved = read_record(path, "remove it")
         try:
-            saved = json.loads(path.read_text())
-            other = differences(saved["record"], record)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            was, result = {**saved["record"]}, Measured(**saved["result"])
+        except (KeyError, TypeError) as error:
             raise OutputError(f"{path} is damaged ({error}): remove it") from error
-        if not other:
-            done[key] = saved["result"]
-        elif not settings.overwrite:
-            raise OutputError(
-                f"{path} was made with other settings ({', '.join(other)}): choose another output, "
-                "or pass --overwrite to compute it again"
-            )
+        if not settings.overwrite:
+            check_same(
+                was, record, f"{path} was made with other settings",
+                "choose another output, or pass --overwrite to compute it again",
+            )  # fmt: skip
+        if not differences(was, record):
+            done[key] = result
     for key in records:
-        try:
-            result_file(settings, *key).parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"{folder}: cannot make it ({error.strerror})") from error
+        make_folder(result_file(settings, *key).parent)
     if done:
         logger.warning("%s: going on, %d of %d results are there", folder, len(done), len(records))
     return done
 
 
-def save(path: Path, record: dict, result: dict, pictures: dict[str, np.ndarray]) -> None:
+def save(path: Path, record: dict, result: Measured, pictures: dict[str, np.ndarray]) -> None:
     """The pictures first: numbers that are there mean that all is."""
     write_arrays(path.with_suffix(".npz"), **pictures)
-    write_text(path, json.dumps({"record": record, "result": result}, allow_nan=False))
+    write_text(path, json.dumps({"record": record, "result": result._asdict()}, allow_nan=False))
 
 
 # ---- Tables
@@ -514,42 +513,6 @@ def summarise(settings, shared, plans, recordings, methods, done, gaps) -> dict:
             "over sequences": {name: mean(sequences, name, weigh=False) for name in names},
             "over frames": {name: mean(sequences, name, weigh=True) for name in names},
         },
-    }
-
-
-def summary(found: dict) -> dict:
-    """The numbers of one method and sequence with their means; null where there is a gap."""
-    means = {}
-    for name in METRICS:
-        values = [value for value in found["values"].get(name, []) if value is not None]
-        means[name] = None if name in found["gaps"] else sum(values) / len(values)
-    return {"means": means, **found}
-
-
-def mean(sequences: dict, method: str, weigh: bool) -> dict:
-    """Means of a method over sequences, or, weighed, over all of their frames."""
-    entries = [entry["methods"][method] for entry in sequences.values()]
-    there = [entry for entry in entries if "gap" not in entry]
-    if not there:
-        return {"gap": entries[0]["gap"]}
-    means, gaps = {}, {}
-    for name in METRICS:
-        with_it = [entry for entry in there if entry["means"][name] is not None]
-        weights = [
-            sum(v is not None for v in entry["values"][name]) if weigh else 1 for entry in with_it
-        ]
-        values = [entry["means"][name] for entry in with_it]
-        means[name] = float(np.average(values, weights=weights)) if values else None
-        if len(with_it) < len(there):  # a mean of fewer sequences is no match for one of all
-            why = next(entry["gaps"][name] for entry in there if name in entry["gaps"])
-            count = len(there) - len(with_it)
-            gaps[name] = f"{why} in {count} of {len(there)} sequences" if values else why
-    return {
-        "means": means,
-        "gaps": gaps,
-        "sequences": len(there),
-        "of_sequences": len(entries),
-        "frames": sum(entry["frames"] for entry in there),
     }
 
 

@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from firenet_jax.events import RecordingError, counted, parse_size, rate_in_words, until_damage
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import counted, rate_in_words, until_damage
 from firenet_jax.filters import hot_pixels_of
 from firenet_jax.readers import open_recording
+from firenet_jax.settings import parse_size
 from firenet_jax.storage.progress import Bytes, bar
 from firenet_jax.windows import cut, usual
 

@@ -12,12 +12,14 @@ from urllib.parse import urlsplit
 import tyro
 
 from firenet_jax.checkpoint import load_weights
-from firenet_jax.events import RecordingError, counted, parse_size
+from firenet_jax.errors import RecordingError, SettingsError
+from firenet_jax.events import counted
 from firenet_jax.live import sources
 from firenet_jax.live.engine import Figures, pictures
 from firenet_jax.live.page import Board, serve
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
+from firenet_jax.settings import parse_size
 from firenet_jax.storage.screen import Screen
 from firenet_jax.windows import LONGEST, Windows
 
@@ -68,9 +70,9 @@ class Live:
     def __post_init__(self):
         for name in ("speed", "repeat", "behind", "longest"):
             if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}, but must be more than 0")
+                raise SettingsError(f"{name} is {getattr(self, name)}, but must be more than 0")
         if not 0 <= self.port < 2**16:
-            raise ValueError(f"port is {self.port}, but ports are 0 to 65535")
+            raise SettingsError(f"port is {self.port}, but ports are 0 to 65535")
         Windows(events_per_pixel=self.events_per_pixel)  # checks it
 
 
@@ -83,7 +85,7 @@ def source_of(settings: Live) -> sources.Source:
     if settings.source == "camera":
         return sources.camera()
     if settings.sensor_size is None:
-        raise ValueError(
+        raise SettingsError(
             f"{settings.source}: a stream does not say how large the sensor is: pass --sensor-size "
             "WIDTHxHEIGHT, or --replay where this is a recording"
         )
@@ -102,7 +104,7 @@ def _pieces(source: str):
         except ValueError:
             port = None
         if not host or not port:
-            raise ValueError(f"{source}: expected {address.scheme}://HOST:PORT")
+            raise SettingsError(f"{source}: expected {address.scheme}://HOST:PORT")
         reach = sources.udp if address.scheme == "udp" else sources.tcp
         return reach(host, port), address.scheme == "udp"
     if not Path(source).is_file():
@@ -122,7 +124,7 @@ def run(settings: Live) -> None:
     try:
         server = serve(board, figures.summary, source.name, settings.port)
     except OSError as error:
-        raise ValueError(
+        raise SettingsError(
             f"port {settings.port} is taken ({error}): pass another --port, or --port 0"
         ) from error
     address = f"http://127.0.0.1:{server.server_address[1]}/"

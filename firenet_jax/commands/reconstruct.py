@@ -27,16 +27,8 @@ from tqdm import tqdm
 from firenet_jax import filters
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.devices import BATCH, EVERYWHERE, in_a_row, shared
-from firenet_jax.events import (
-    Events,
-    Recording,
-    RecordingError,
-    counted,
-    logger,
-    parse_size,
-    rate_in_words,
-    until_damage,
-)
+from firenet_jax.errors import RecordingError, logger
+from firenet_jax.events import Events, Recording, counted, parse_size, rate_in_words, until_damage
 from firenet_jax.network import Weights
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording

@@ -14,7 +14,6 @@ period: times the period, what was at x - d(x) in the last image is at x now (ba
 A file appears under its name when it is whole, so a run that was interrupted goes on where it was.
 """
 
-import dataclasses
 import importlib.metadata
 import io
 import itertools
@@ -34,11 +33,12 @@ import jax
 import numpy as np
 import tyro
 
-from firenet_jax.events import Events, concatenate, parse_size
+from firenet_jax.errors import OutputError, PictureError, SettingsError
+from firenet_jax.events import Events, concatenate
+from firenet_jax.settings import check_seed, parse_size
 from firenet_jax.simulation.scenes import (
     Scene,
     SceneSettings,
-    check_seed,
     flow,
     random_scene,
     rendering_times,
@@ -52,17 +52,18 @@ from firenet_jax.simulation.sensor import (
     with_faults,
 )
 from firenet_jax.simulation.textures import load_textures
-from firenet_jax.storage.files import (
-    OutputError,
-    alone_in,
-    check_readable,
-    differences,
-    partial_name,
-    write_text,
-    writing,
-)
+from firenet_jax.storage.files import check_readable, partial_name, write_text, writing
 from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import bar
+from firenet_jax.storage.runs import (
+    alone_in,
+    as_text,
+    check_same,
+    differences,
+    make_folder,
+    read_record,
+    recorded,
+)
 
 ROWS = 1 << 16  # events in a chunk of the file, and so many are written at once
 GZIP = 4  # for 50 % more time than level 1: events take 10 % less room, flow 25 %
@@ -116,16 +117,16 @@ class Simulate:
 
     def __post_init__(self):
         if not 0 < self.seconds <= LONGEST_SCENE:
-            raise ValueError(
+            raise SettingsError(
                 f"seconds is {self.seconds}, but a sequence lasts more than 0 and up to "
                 f"{LONGEST_SCENE:g}: make more sequences instead"
             )
         if not 0 < self.fps <= 1e5:
-            raise ValueError(f"fps is {self.fps}, but must be more than 0 and up to 100000")
+            raise SettingsError(f"fps is {self.fps}, but must be more than 0 and up to 100000")
         if self.sequences < 1:
-            raise ValueError(f"sequences is {self.sequences}, but must be 1 or more")
+            raise SettingsError(f"sequences is {self.sequences}, but must be 1 or more")
         if self.validation is not None and not 0 <= self.validation <= self.sequences:
-            raise ValueError(
+            raise SettingsError(
                 f"validation is {self.validation}, but must be between 0 and the number of "
                 f"sequences, {self.sequences}"
             )
@@ -134,7 +135,7 @@ class Simulate:
         if self.video is not None:
             idle = [name for name in OF_SCENES if getattr(self, name) != getattr(Simulate, name)]
             if idle:
-                raise ValueError(
+                raise SettingsError(
                     f"{', '.join(idle)}: no part in turning a video into events: leave it out"
                 )
 
@@ -470,46 +471,35 @@ def rounded_flow(velocity: np.ndarray) -> np.ndarray:
 
 def describe(settings: Simulate) -> dict:
     """All that a sequence depends on, apart from its number; ready for JSON."""
-    choices = dataclasses.asdict(settings)
-    for name in ("output", "sequences", "validation", "video", "overwrite"):
-        del choices[name]
-    choices["images"] = None if settings.images is None else str(settings.images.resolve())
-    choices["sensor_size"] = settings.sensor_size or "240x180"
-    choices["version"] = importlib.metadata.version("firenet-jax")
-    return json.loads(json.dumps(choices))
+    return recorded(
+        settings,
+        but=("output", "sequences", "validation", "video", "overwrite"),
+        images=None if settings.images is None else settings.images.resolve(),
+        sensor_size=settings.sensor_size or "240x180",
+        version=importlib.metadata.version("firenet-jax"),
+    )
 
 
 def open_folder(settings: Simulate) -> None:
     """Finds that the folder is new or one to go on with; else raises OutputError."""
     folder, record = settings.output, describe(settings)
     kept = folder / "settings.json"
-    if kept.is_file():
-        try:
-            found = json.loads(kept.read_text())
-        except (OSError, ValueError) as error:
-            raise OutputError(f"{kept} is damaged ({error}): choose another output") from error
-        other = differences(found, record)
-        if other and not next(folder.glob("*/??????.h5"), None):
-            kept.unlink()  # an earlier run wrote nothing else
-        elif other:
-            raise OutputError(
-                f"{folder} holds sequences of other settings ({', '.join(other)}): choose another "
-                "output, or go on with the same settings"
-            )
-    elif folder.is_dir() and any(folder.iterdir()):
+    found = read_record(kept, "choose another output")
+    if found is None and any(folder.iterdir()):
         raise OutputError(
             f"{folder} is not empty, and holds no settings.json of an earlier run: choose another "
             "output"
         )
-    try:
-        for name in ("train", "validation"):
-            (folder / name).mkdir(parents=True, exist_ok=True)
-        if not kept.is_file():
-            write_text(kept, json.dumps(record, indent=1) + "\n")
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: cannot write there ({error.strerror or error}): choose another output"
-        ) from error
+    empty = not next(folder.glob("*/??????.h5"), None)
+    if found is not None and not empty:
+        check_same(
+            found, record, f"{folder} holds sequences of other settings",
+            "choose another output, or go on with the same settings",
+        )  # fmt: skip
+    for name in ("train", "validation"):
+        make_folder(folder / name)
+    if found is None or differences(found, record):
+        write_text(kept, as_text(record) + "\n")
 
 
 def in_words(size: float) -> str:
@@ -537,14 +527,13 @@ def simulate_clip(settings: Simulate) -> Path:
         raise OutputError(f"{path}: with --video the output is one file: name it {path}.h5")
     if path.is_dir() or (path.exists() and not settings.overwrite):
         raise OutputError(f"{path} exists: choose another output or pass --overwrite")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{path.parent}: cannot make this folder ({error.strerror})") from error
+    make_folder(path.parent)
     size = parse_size(settings.sensor_size)
     pictures = list(itertools.islice(read_clip(clip, size), 2))
     if len(pictures) < 2:
-        raise ValueError(f"{clip}: holds fewer than two pictures, so no change: name a video file")
+        raise PictureError(
+            f"{clip}: holds fewer than two pictures, so no change: name a video file"
+        )
     height, width = pictures[0].image.shape
     sensor = with_faults(settings.sensor) if settings.faults else settings.sensor
     camera = random_sensor(
@@ -582,7 +571,7 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
     try:
         with av.open(str(path), metadata_errors="replace") as container:
             if not container.streams.video or container.format.name == "tty":  # any text is
-                raise ValueError(f"{path}: holds no video, only sound or text: name a video file")
+                raise PictureError(f"{path}: holds no video, only sound or text: name a video file")
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             period = 1 / (stream.average_rate or Fraction(25))
@@ -591,7 +580,7 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
                 first = seconds if first is None else first
                 time = round((seconds - first) * 1_000_000)
                 if last is not None and not 0 < time - last <= LONGEST:
-                    raise ValueError(
+                    raise PictureError(
                         f"{path}: picture {number + 1} comes {(time - last) * 1e-6:g} s after the "
                         f"one before, expected more than 0 and up to {LONGEST * 1e-6:.1f}: "
                         "convert the clip to a constant rate"
@@ -604,6 +593,6 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
                 yield Picture(time, np.round(grey).astype(np.uint8), None)
     except (av.FFmpegError, OSError, UnicodeDecodeError) as error:  # names in it that are no text
         reason = getattr(error, "strerror", None) or error
-        raise ValueError(
+        raise PictureError(
             f"{path}: cannot be read as a video ({reason}): name a file that ffmpeg can play"
         ) from error

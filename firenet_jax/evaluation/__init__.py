@@ -5,5 +5,6 @@ equalise       histogram equalisation, hard and soft
 lpips          LPIPS by weights that the user names
 methods        whatever makes images of events, behind one interface; `baselines` are some
 comparison     images of a method, frames of a camera -> numbers, batch by batch
+results        the metrics by name; numbers of frames -> means, and why one is not there
 report         results -> table, CSV, a page of HTML; only presents
 """

@@ -13,7 +13,7 @@ import numpy as np
 
 from firenet_jax.evaluation import lpips, metrics
 from firenet_jax.evaluation.equalise import Kind, equalise
-from firenet_jax.evaluation.report import METRICS
+from firenet_jax.evaluation.results import METRICS, Measured
 from firenet_jax.events import Recording
 
 BATCH = 8  # images that are compared at once
@@ -71,7 +71,7 @@ def matched(
         yield best[0], best[2]
 
 
-class Numbers:
+class Measurements:
     """The numbers of one method's images of one sequence, batch by batch."""
 
     def __init__(self, plan: Plan, kind: Kind, learned: lpips.Lpips | None):
@@ -124,8 +124,8 @@ class Numbers:
         ).tolist()
         return [error if k else None for error, k in zip(errors, known, strict=False)]
 
-    def result(self, empty: int, seconds: float) -> dict:
-        """Ready for JSON: a value that is not finite becomes null, its metric a gap."""
+    def result(self, empty: int, seconds: float) -> Measured:
+        """A value that is not finite becomes null, its metric a gap."""
         gaps = {}
         values = {}
         for name, series in self.values.items():
@@ -138,18 +138,18 @@ class Numbers:
             values[name] = [v if ok else None for v, ok in zip(series, good, strict=True)]
         if not self.learned:
             gaps["lpips"] = self.no_lpips
-        return {
-            "frames": len(self.places),
-            "of": self.plan.last - self.plan.first,
-            "windows_without_events": empty,
-            "seconds": round(seconds, 3),
-            "gaps": gaps,
-            "frame_numbers": [int(self.plan.numbers[place]) for place in self.places],
-            "times": [
+        return Measured(
+            frames=len(self.places),
+            of=self.plan.last - self.plan.first,
+            windows_without_events=empty,
+            seconds=round(seconds, 3),
+            gaps=gaps,
+            frame_numbers=[int(self.plan.numbers[place]) for place in self.places],
+            times=[
                 round((int(t) - self.plan.origin) / 1e6, 6) for t in self.plan.times[self.places]
             ],
-            "values": values,
-        }
+            values=values,
+        )
 
 
 def _whole(batch: np.ndarray) -> np.ndarray:

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.checkpoint import load_weights
+from firenet_jax.errors import SettingsError, logger
 from firenet_jax.evaluation.baselines import e2vid, high_pass, manifold
-from firenet_jax.events import logger
 from firenet_jax.network import Weights, initial_state
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.storage.files import named
@@ -47,7 +47,7 @@ class Missing(NamedTuple):
     reason: str
 
 
-class Sized(NamedTuple):
+class PaddedState(NamedTuple):
     """The state of a network that pads its input: it alone does not tell the sensor's size."""
 
     network: Any
@@ -73,11 +73,11 @@ def load(
     """
     for name, given in (("firenet", weights), ("e2vid", e2vid_weights)):
         if given and name not in names:
-            raise ValueError(f"weights are given, but {name} is not among the methods: add it")
+            raise SettingsError(f"weights are given, but {name} is not among the methods: add it")
     found: list[Method | Missing] = []
     for name in names:
         if name not in NAMES:
-            raise ValueError(f"no method {name!r}: choose from {', '.join(NAMES)}")
+            raise SettingsError(f"no method {name!r}: choose from {', '.join(NAMES)}")
         if name == "firenet" and weights:
             found += [firenet(named(path).stem, load_weights(path)) for path in weights]
         elif name == "firenet":
@@ -97,7 +97,7 @@ def load(
     found_names = [method.name for method in found]
     twice = next((name for name in found_names if found_names.count(name) > 1), None)
     if twice:
-        raise ValueError(
+        raise SettingsError(
             f"two methods are named {twice}: rename a file of weights, or name it once"
         )
     return found
@@ -125,7 +125,7 @@ def recurrent_unet(name: str, params, settings: e2vid.Settings = e2vid.Settings(
     params = jax.device_put(params)
 
     def initial(height, width):
-        return Sized(e2vid.initial_state(1, height, width, settings), height, width)
+        return PaddedState(e2vid.initial_state(1, height, width, settings), height, width)
 
     def step(state, window):
         tensor = _tensor(window, state.height, state.width)

@@ -18,28 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
+from firenet_jax.evaluation.results import METRICS
 from firenet_jax.events import Events
 
-
-class Metric(NamedTuple):
-    title: str
-    better: str  # "lower" or "higher"
-    digits: int
-
-
-METRICS = {
-    "mse": Metric("MSE", "lower", 4),
-    "psnr": Metric("PSNR", "higher", 2),
-    "ssim": Metric("SSIM", "higher", 3),
-    "ms_ssim": Metric("MS-SSIM", "higher", 3),
-    "haarpsi": Metric("HaarPSI", "higher", 3),
-    "cw_ssim": Metric("CW-SSIM", "higher", 3),
-    "nlpd": Metric("NLPD", "lower", 3),
-    "gmsd": Metric("GMSD", "lower", 3),
-    "random_features": Metric("Features", "lower", 3),
-    "lpips": Metric("LPIPS", "lower", 3),
-    "temporal_error": Metric("Temporal", "lower", 4),
-}
 # Easy to tell apart, also with most kinds of colour blindness (Okabe and Ito).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 CURVES = ("mse", "ssim", "nlpd", "temporal_error")

@@ -17,7 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from firenet_jax.events import Events, RecordingError, concatenate
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, concatenate
 from firenet_jax.network import Weights
 from firenet_jax.pictures import Display
 from firenet_jax.reconstruction import Network, events_to_pictures, initial_session

@@ -22,7 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firenet_jax.events import Events, Recording, RecordingError
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, Recording
 
 TICK = 0.005  # seconds between two looks at a source that has nothing
 SLICE = 0.002  # seconds of a replay that arrive together

@@ -20,19 +20,18 @@ from types import ModuleType
 
 import numpy as np
 
+from firenet_jax.errors import RecordingError, logger
 from firenet_jax.events import (
     LATEST,
     REACH,
     Events,
     Frames,
     Recording,
-    RecordingError,
     Rows,
     Triggers,
     checked,
     concatenate,
     event_number,
-    logger,
     no_triggers,
     until_damage,
 )

@@ -24,7 +24,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firenet_jax.events import Events, Frames, RecordingError, Rows, Triggers, logger
+from firenet_jax.errors import RecordingError, logger
+from firenet_jax.events import Events, Frames, Rows, Triggers
 from firenet_jax.readers import CHUNK, Source, aedat, all_triggers, joined, to_events, unwrap
 
 PICTURE, IMU, EXPOSED = 1 << 31, 1 << 11, 1 << 10  # bits of a DAVIS

@@ -21,7 +21,8 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from firenet_jax.events import Events, Frames, RecordingError, Rows, Triggers
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, Frames, Rows, Triggers
 from firenet_jax.readers import Source, aedat, all_triggers, joined, reading, to_events, to_frame
 
 SPECIAL, POLARITY, FRAME = 0, 1, 2

@@ -23,7 +23,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pyarrow as pa
 
-from firenet_jax.events import Events, Frames, RecordingError, Rows, Triggers
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, Frames, Rows, Triggers
 from firenet_jax.readers import Source, aedat, all_triggers, joined, reading, to_events, to_frame
 
 MAGIC = b"#!AER-DAT4.0\r\n"

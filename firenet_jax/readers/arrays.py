@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from firenet_jax.events import Events, Recording, RecordingError, Rows, checked
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, Recording, Rows, checked
 from firenet_jax.readers import in_chunks, to_events
 from firenet_jax.readers.text import NAMES
 

@@ -18,7 +18,8 @@ from types import ModuleType
 
 import numpy as np
 
-from firenet_jax.events import Events, RecordingError, Rows, Triggers
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, Rows, Triggers
 from firenet_jax.readers import (
     CHUNK,
     Source,

@@ -17,7 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firenet_jax.events import Events, RecordingError, Rows
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, Rows
 from firenet_jax.readers import CHUNK, Source, to_events, unwrap
 
 TYPES = (0x00, 0x0C)

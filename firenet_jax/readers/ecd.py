@@ -16,7 +16,8 @@ from pathlib import Path, PurePath
 import numpy as np
 from PIL import Image
 
-from firenet_jax.events import Frames, RecordingError, logger
+from firenet_jax.errors import RecordingError, logger
+from firenet_jax.events import Frames
 from firenet_jax.readers import Source, microseconds, reading, text, to_frame
 
 MOST = 1 << 26  # bytes of images.txt, and of a picture

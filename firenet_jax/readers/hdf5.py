@@ -21,7 +21,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from firenet_jax.events import Events, Frames, RecordingError, Rows
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, Frames, Rows
 from firenet_jax.readers import (
     Source,
     extra,
@@ -170,10 +171,26 @@ def _frames(path: Path, file: h5py.File, layout: str) -> Frames | None:
         return None
     names = sorted(file["images"])
     times = np.array([file["images"][name].attrs["timestamp"] for name in names])
-    return Frames(frame_times(path, times), lambda i: _frame(path, f"images/{names[i]}", ...))
+    return Frames(
+        frame_times(path, times),
+        lambda i: _frame(path, f"images/{names[i]}", ...),
+        lambda i: _flow(path, f"flow/{names[i].replace('image', 'flow')}"),
+    )
 
 
 def _frame(path: Path, name: str, index) -> np.ndarray:
     with opened(path) as file:
         _check_stored(path, file[name])
         return to_frame(file[name][index], path)
+
+
+def _flow(path: Path, name: str) -> np.ndarray | None:
+    with opened(path) as file:
+        if name not in file:
+            return None
+        velocity = file[name]
+        _check_stored(path, velocity)
+        size = (2, *file["images"][name.removeprefix("flow/").replace("flow", "image")].shape[:2])
+        if velocity.shape != size:
+            raise RecordingError(f"{path}, {name}: has the shape {velocity.shape}, expected {size}")
+        return velocity[()]

@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from firenet_jax.events import Events, RecordingError, Rows
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, Rows
 from firenet_jax.readers import CHUNK, Source, to_events
 
 MARK = 240

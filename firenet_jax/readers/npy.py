@@ -21,7 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from firenet_jax.events import Events, Frames, RecordingError, Rows
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, Frames, Rows
 from firenet_jax.readers import (
     Source,
     frame_times,

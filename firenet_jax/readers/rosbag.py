@@ -27,7 +27,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firenet_jax.events import Events, Frames, RecordingError, Triggers, logger
+from firenet_jax.errors import RecordingError, logger
+from firenet_jax.events import Events, Frames, Triggers
 from firenet_jax.readers import (
     Source,
     all_triggers,

@@ -27,7 +27,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 
-from firenet_jax.events import REACH, Events, RecordingError, Rows, logger
+from firenet_jax.errors import RecordingError, logger
+from firenet_jax.events import REACH, Events, Rows
 from firenet_jax.readers import Source, reading, to_events
 
 BLOCK = 1 << 21  # bytes parsed at once: about 90,000 events

@@ -22,6 +22,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from firenet_jax.errors import SettingsError
+from firenet_jax.settings import check_range
 from firenet_jax.warp import sample
 
 WAVES = 3  # sinusoids in each of the six coordinates of a motion
@@ -29,22 +31,6 @@ PAUSES = 2  # at most so many stops in a scene
 OUTLINE = 96  # cells on a side of an object's outline
 MARGIN = 1.3  # the outline's field reaches so many radii from the centre
 BLUR = 4  # pixels of the blurring kernel on each side of its middle
-
-
-def check_range(name: str, bounds: tuple[float, float]) -> None:
-    """Raises ValueError unless a number can be drawn log-uniformly between these."""
-    least, greatest = bounds
-    if not (0 < least <= greatest and math.isfinite(greatest)):
-        raise ValueError(
-            f"{name} is {least:g} {greatest:g}, but is drawn log-uniformly: "
-            "both must be more than 0, the least first"
-        )
-
-
-def check_seed(seed: int) -> None:
-    """Raises ValueError unless jax, numpy and grain all take it."""
-    if not 0 <= seed < 2**32:
-        raise ValueError(f"seed is {seed}, but must be 0 or more, and less than 2^32")
 
 
 @dataclass(frozen=True)
@@ -93,15 +79,17 @@ class SceneSettings:
             check_range(name, getattr(self, name))
         for name in ("pause", "halt", "still", "plain", "hdr"):
             if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, but is a probability, 0 to 1")
+                raise SettingsError(
+                    f"{name} is {getattr(self, name)}, but is a probability, 0 to 1"
+                )
         if self.objects < 0:
-            raise ValueError(f"objects is {self.objects}, but must be 0 or more")
+            raise SettingsError(f"objects is {self.objects}, but must be 0 or more")
         if not 0 <= self.tilt <= 1:
-            raise ValueError(f"tilt is {self.tilt} radians, but must be between 0 and 1")
+            raise SettingsError(f"tilt is {self.tilt} radians, but must be between 0 and 1")
         for name in ("black", "white"):
             least, greatest = getattr(self, name)
             if not 0 <= least <= greatest <= 1:
-                raise ValueError(
+                raise SettingsError(
                     f"{name} is {least:g} {greatest:g}, but both are intensities, 0 to 1, "
                     "the least first"
                 )
@@ -199,19 +187,7 @@ def random_scene(
     outlines = jnp.where(absent[:, None, None], -jnp.float32(side), outlines)
     seen_radius = side * log_uniform(settings.size, (settings.objects,))
 
-    # One pause at most in each half, so that two never overlap.
-    ramp = 0.02 * duration
-    start = duration * (uniform((0.02, 0.3), (PAUSES,)) + jnp.arange(PAUSES) / PAUSES)
-    length = duration * uniform((0.02, 0.5 - 0.3 - 0.02), (PAUSES,))
-    length = jnp.where(uniform((0.0, 1.0), (PAUSES,)) < settings.pause, length, 0.0)
-    pauses = jnp.stack([start, start + length, jnp.broadcast_to(ramp, (PAUSES,))], -1)
-
-    if settings.halt:
-        halted = uniform((0.0, 1.0)) < settings.halt
-        for_good = jnp.stack([start, start + 100 * duration * jnp.array([1.0, 0.0])], -1)
-        # The second pause, of no length then, must not count twice.
-        pauses = jnp.where(halted, jnp.concatenate([for_good, pauses[:, 2:]], -1), pauses)
-
+    pauses = _pauses(uniform, duration, settings)
     if settings.plain:
         plain = (uniform((0.0, 1.0)) < settings.plain) & (shown > 0)
         canvases = canvases.at[0].set(jnp.where(plain, uniform((0.2, 0.8)), canvases[0]))
@@ -236,6 +212,23 @@ def random_scene(
     pace = jnp.where(still, 0.0, scene.camera.pace)
     scene = scene._replace(camera=scene.camera._replace(pace=pace))
     return _at_speed(scene, speed, duration, height, width)
+
+
+def _pauses(uniform, duration, settings: SceneSettings) -> jax.Array:
+    """(3, PAUSES): starts, ends and ramps of a scene's pauses, seconds."""
+    # One pause at most in each half, so that two never overlap.
+    ramp = 0.02 * duration
+    start = duration * (uniform((0.02, 0.3), (PAUSES,)) + jnp.arange(PAUSES) / PAUSES)
+    length = duration * uniform((0.02, 0.5 - 0.3 - 0.02), (PAUSES,))
+    length = jnp.where(uniform((0.0, 1.0), (PAUSES,)) < settings.pause, length, 0.0)
+    pauses = jnp.stack([start, start + length, jnp.broadcast_to(ramp, (PAUSES,))], -1)
+
+    if settings.halt:
+        halted = uniform((0.0, 1.0)) < settings.halt
+        for_good = jnp.stack([start, start + 100 * duration * jnp.array([1.0, 0.0])], -1)
+        # The second pause, of no length then, must not count twice.
+        pauses = jnp.where(halted, jnp.concatenate([for_good, pauses[:, 2:]], -1), pauses)
+    return pauses
 
 
 def _dice(key: jax.Array, count: int):

@@ -29,16 +29,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from firenet_jax.events import Events, concatenate
-from firenet_jax.simulation.scenes import (
-    Scene,
-    SceneSettings,
-    check_range,
-    flow,
-    random_scene,
-    render,
-)
-from firenet_jax.tensors import BINS
+from firenet_jax.errors import SettingsError
+from firenet_jax.events import BINS, Events, concatenate
+from firenet_jax.settings import check_range
+from firenet_jax.simulation.scenes import Scene, SceneSettings, flow, random_scene, render
 
 EPS = 0.001
 THRESHOLD, SPREAD, REFRACTORY = 0.18, 0.03, 1e-3  # as in the paper, where nothing is said
@@ -47,7 +41,8 @@ AT_ONCE = 4  # events of a pixel in one pass over the picture: fewer passes, les
 LONGEST = 2**31 // TICKS - 1  # microseconds between two renderings
 SLOW, SWIFT = (0.02, 0.3), (16.0, 90.0)  # pixels a window, of rare sequences
 UNEVEN = 4.0  # times the mismatch of others: pixels of one edge fire one by one, not together
-CALM = 2 / 3  # of the slow ones: next to no faults, so that single events can be trusted
+# Of the slow ones: next to no faults, so that single events can be trusted.
+NEARLY_NOISELESS = 2 / 3
 
 
 def _or(said: float | None, default: float) -> float:
@@ -106,13 +101,13 @@ class SensorSettings:
             if _on(getattr(self, name)):
                 check_range(name, getattr(self, name))
         if _on(self.hot) and self.hot[1] > 1:
-            raise ValueError(f"hot is {self.hot}, but is a part of the pixels: at most 1")
+            raise SettingsError(f"hot is {self.hot}, but is a part of the pixels: at most 1")
         if self.threshold is not None and not 0 < self.threshold < math.inf:
-            raise ValueError(f"threshold is {self.threshold}, but must be more than 0")
+            raise SettingsError(f"threshold is {self.threshold}, but must be more than 0")
         for name in ("threshold_spread", "asymmetry", "refractory", "mismatch", "cutoff_dark"):
             value = getattr(self, name)
             if value is not None and not (value >= 0 and math.isfinite(value)):
-                raise ValueError(f"{name} is {value}, but must be 0 or more")
+                raise SettingsError(f"{name} is {value}, but must be 0 or more")
         # A range wins, so what is given beside it would silently do nothing.
         for name, owner in (
             ("threshold", "threshold_range"),
@@ -120,7 +115,7 @@ class SensorSettings:
             ("refractory", "refractory_range"),
         ):
             if None not in (getattr(self, owner), getattr(self, name)):
-                raise ValueError(
+                raise SettingsError(
                     f"{name} plays no part beside {owner}: "
                     f"pass --{owner.replace('_', '-')} None too"
                 )
@@ -521,7 +516,7 @@ def _votes(planes: jax.Array, low, runs, passed: jax.Array, total: jax.Array) ->
 def check_rare(slow: float, swift: float) -> None:
     """Raises ValueError where these are no parts of the sequences, or leave none for `motion`."""
     if not (slow >= 0 and swift >= 0 and slow + swift < 1):
-        raise ValueError(
+        raise SettingsError(
             f"slow is {slow} and swift is {swift}, but they are parts of the sequences: 0 or more, "
             "together less than 1"
         )
@@ -570,7 +565,7 @@ def random_setups(
     of Gehrig et al., "Video to Events", CVPR 2020, or slow and swift leave nothing.
     """
     if motion[1] > renderings:
-        raise ValueError(
+        raise SettingsError(
             f"windows with {motion[1]} pixels of motion need {math.ceil(motion[1])} "
             f"renderings, not {renderings}"
         )
@@ -578,18 +573,9 @@ def random_setups(
     scene_key, sensor_key, number_key = jax.random.split(key, 3)
     numbers = jax.random.uniform(number_key, (2, batch))
 
-    def log_uniform(bounds, numbers):
-        low, high = (math.log(bound) for bound in bounds)
-        return jnp.exp(low + (high - low) * numbers)
-
-    speed, kind = log_uniform(scene.speed, numbers[0]), numbers[1]
-    is_slow, is_swift = kind < slow, kind >= 1 - swift
-    pixels = log_uniform(motion, jnp.clip((kind - slow) / (1 - slow - swift), 0, 1))
-    pixels = jnp.where(is_slow, log_uniform(SLOW, kind / (slow or 1)), pixels)
-    pixels = jnp.where(is_swift, log_uniform(SWIFT, (kind - 1 + swift) / (swift or 1)), pixels)
-    duration = jnp.clip(1e6 * pixels / speed, 1e3, 3e5).astype(jnp.int32)
-    usual = jnp.minimum(speed, 1e6 * renderings / duration)
-    speed = jnp.where(is_slow | is_swift, 1e6 * pixels / duration, usual)
+    speed, duration, is_slow, is_swift = _paces(
+        numbers, scene.speed, motion, renderings, slow, swift
+    )
     size = {"height": height, "width": width}
 
     def one_scene(key, duration, speed):
@@ -600,25 +586,57 @@ def random_setups(
     one_sensor = partial(random_sensor, settings=sensor, **size)
     sensors = jax.vmap(one_sensor)(jax.random.split(sensor_key, batch))
     if slow:
-        apart = jnp.where(is_slow, UNEVEN, 1.0)[:, None, None]
-
-        def uneven(thresholds):
-            mean = thresholds.mean((-2, -1), keepdims=True)
-            return jnp.maximum(mean + apart * (thresholds - mean), 0.01)
-
-        if sensors.on.ndim == 3:  # else all pixels of a sequence have one
-            sensors = sensors._replace(on=uneven(sensors.on), off=uneven(sensors.off))
-        calm = jnp.where(kind < CALM * slow, 0.02, 1.0)
-        if sensors.noise is not None:
-            sensors = sensors._replace(noise=sensors.noise * calm)
-        if sensors.drift is not None:
-            sensors = sensors._replace(drift=sensors.drift * calm[:, None, None])
+        sensors = _uneven(sensors, numbers[1], is_slow, slow)
     if swift:
         grey_key = jax.random.fold_in(number_key, 1)
         grey = jax.random.uniform(grey_key, (batch, 1, 1), minval=0.2, maxval=0.8)
         ground = jnp.where(is_swift[:, None, None], grey, scenes.textures[0])
         scenes = scenes._replace(textures=(ground, *scenes.textures[1:]))
     return sensors, scenes, duration
+
+
+def _paces(
+    numbers: jax.Array,
+    speeds: tuple[float, float],
+    motion: tuple[float, float],
+    renderings: int,
+    slow: float,
+    swift: float,
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """(2, B) uniform numbers -> pixels per second, duration of a window, which are slow or swift;
+    (B,) each. The other arguments are those of `random_setups`."""
+
+    def log_uniform(bounds, numbers):
+        low, high = (math.log(bound) for bound in bounds)
+        return jnp.exp(low + (high - low) * numbers)
+
+    speed, kind = log_uniform(speeds, numbers[0]), numbers[1]
+    is_slow, is_swift = kind < slow, kind >= 1 - swift
+    pixels = log_uniform(motion, jnp.clip((kind - slow) / (1 - slow - swift), 0, 1))
+    pixels = jnp.where(is_slow, log_uniform(SLOW, kind / (slow or 1)), pixels)
+    pixels = jnp.where(is_swift, log_uniform(SWIFT, (kind - 1 + swift) / (swift or 1)), pixels)
+    duration = jnp.clip(1e6 * pixels / speed, 1e3, 3e5).astype(jnp.int32)
+    usual = jnp.minimum(speed, 1e6 * renderings / duration)
+    speed = jnp.where(is_slow | is_swift, 1e6 * pixels / duration, usual)
+    return speed, duration, is_slow, is_swift
+
+
+def _uneven(sensors: Sensor, kind: jax.Array, is_slow: jax.Array, slow: float) -> Sensor:
+    """Thresholds of a slow sequence's pixels differ more, and most have next to no noise."""
+    apart = jnp.where(is_slow, UNEVEN, 1.0)[:, None, None]
+
+    def uneven(thresholds):
+        mean = thresholds.mean((-2, -1), keepdims=True)
+        return jnp.maximum(mean + apart * (thresholds - mean), 0.01)
+
+    if sensors.on.ndim == 3:  # else all pixels of a sequence have one
+        sensors = sensors._replace(on=uneven(sensors.on), off=uneven(sensors.off))
+    share = jnp.where(kind < NEARLY_NOISELESS * slow, 0.02, 1.0)
+    if sensors.noise is not None:
+        sensors = sensors._replace(noise=sensors.noise * share)
+    if sensors.drift is not None:
+        sensors = sensors._replace(drift=sensors.drift * share[:, None, None])
+    return sensors
 
 
 def window_bounds(durations: jax.Array, windows: int, first: jax.Array | int = 0) -> jax.Array:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from firenet_jax.events import logger
+from firenet_jax.errors import PictureError, logger
 
 PHOTOGRAPHS = {  # that come inside the wheels of these packages
     "skimage/data": (
@@ -72,7 +72,7 @@ def photographs(packages: dict[str, tuple[str, ...]] = PHOTOGRAPHS) -> list[Path
 
 def _pictures(folder: Path) -> list[Path]:
     if not folder.is_dir():
-        raise ValueError(f"{folder}: no such folder: name one with pictures in it")
+        raise PictureError(f"{folder}: no such folder: name one with pictures in it")
     held_out = {name for names in HELD_OUT.values() for name in names}
     found = [
         Path(at) / name
@@ -83,7 +83,7 @@ def _pictures(folder: Path) -> list[Path]:
     kept = [path for path in found if path.name.lower() not in held_out]
     if not kept:
         but = f" but {found[0].name}, which is held out for testing" if found else ""
-        raise ValueError(
+        raise PictureError(
             f"{folder}: holds no pictures ({', '.join(SUFFIXES)}){but}: name a folder that does"
         )
     return sorted(kept)
@@ -95,7 +95,7 @@ def _cuttings(rng, paths: list[Path], count: int, size: int, source) -> list[np.
     problem = ""
     while len(cuttings) < count:
         if not usable:
-            raise ValueError(
+            raise PictureError(
                 f"{source or 'scikit-image'}: none of {len(paths)} pictures can be used for "
                 f"textures of {size} pixels; the last: {problem}"
             )

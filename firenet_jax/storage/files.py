@@ -10,9 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-
-class OutputError(ValueError):
-    """A file cannot be written as asked; the message is one sentence."""
+from firenet_jax.errors import OutputError
 
 
 def named(path: Path) -> Path:
@@ -117,19 +115,6 @@ def locked(folder: Path, name: Path | None = None):
         os.close(handle)
 
 
-@contextlib.contextmanager
-def alone_in(folder: Path):
-    """Makes this folder where it is missing; no other run can write into it meanwhile."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: cannot make this folder ({error.strerror or error}): choose another output"
-        ) from error
-    with locked(folder):
-        yield
-
-
 def write_text(path: Path, text: str) -> None:
     """Who reads the file, while this runs or after it was killed, finds the old text or the new."""
     beside = partial_name(path)
@@ -156,15 +141,3 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     except Exception as error:  # damaged bytes reach every kind: Value, BadZip, EOF, tokenize's
         reason = " ".join(str(error).split())[:100]  # numpy's span lines
         raise OutputError(f"{path} is damaged ({reason}): remove it and run again") from error
-
-
-def differences(found: dict, now: dict, but: tuple[str, ...] = ()) -> list[str]:
-    """What is said of each setting of an earlier run that differs, those within others too."""
-    said = []
-    for name in sorted({*found, *now} - set(but)):
-        was, is_now = found.get(name), now.get(name)
-        if isinstance(was, dict) and isinstance(is_now, dict):
-            said += [f"{name}.{inner}" for inner in differences(was, is_now)]
-        elif was != is_now:
-            said.append(f"{name} was {was}, now {is_now}")
-    return said

@@ -28,6 +28,7 @@ from pathlib import Path
 
 import numpy as np
 
+from firenet_jax.errors import CheckpointError
 from firenet_jax.storage.files import check_readable
 
 MAGIC_NUMBER = 0x1950A86A20F9469CFC6C
@@ -35,10 +36,6 @@ PROTOCOL = 1001
 MAX_ELEMENTS = 2**28  # 100 times the largest network of this field; a stride of 0 can claim any
 
 AGAIN = "copy or download it again"
-
-
-class CheckpointError(ValueError):
-    """Weights cannot be used; the message is one sentence: file, what is wrong, what to do."""
 
 
 def read_state_dict(path: str | Path) -> dict[str, np.ndarray]:

@@ -18,7 +18,8 @@ import av
 import numpy as np
 from PIL import Image
 
-from firenet_jax.storage.files import OutputError, lock_file, locked, partial_name, writing
+from firenet_jax.errors import OutputError
+from firenet_jax.storage.files import lock_file, locked, partial_name, writing
 
 VIDEOS = (".mp4", ".gif")
 # What is no folder's name: a dot alone, as in out_0.35, does not make a file of it.

@@ -2,7 +2,10 @@
 
     losses         Eq. 2 of the paper, with the distances that it may be made of
     batches        HDF5 sequences -> batches, augmented
-    run            the step (`train_step`), and the run with its folder
+    step           (parameters, data) -> parameters: simulate, scan, differentiate, update
+    settings       what `firenet train` asks for
+    log            losses, pictures and weights of a run, on disk
+    run            all of these together, in a folder where it goes on
 
-Read `run.train_step` first: simulate, scan, differentiate, update.
+Read `step.train_step` first.
 """

@@ -25,11 +25,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from firenet_jax.events import Events, RecordingError, checked, event_number, logger
+from firenet_jax.errors import RecordingError, SettingsError, logger
+from firenet_jax.events import BINS, Events, checked, event_number
 from firenet_jax.readers import CHUNK, frame_times, to_events, to_frame
 from firenet_jax.readers.hdf5 import opened
 from firenet_jax.simulation.sensor import Simulation
-from firenet_jax.tensors import BINS, Packed, pack, voxelise
+from firenet_jax.tensors import Packed, pack, voxelise
 from firenet_jax.warp import warp
 
 SUFFIXES = (".h5", ".hdf5")
@@ -59,9 +60,9 @@ class Augment:
     def __post_init__(self):
         for name in ("flip", "pauses", "stay", "hot_pixels"):
             if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, but must be between 0 and 1")
+                raise SettingsError(f"{name} is {getattr(self, name)}, but must be between 0 and 1")
         if not 0 <= self.voxel_noise < np.inf:
-            raise ValueError(f"voxel_noise is {self.voxel_noise}, but must be 0 or more")
+            raise SettingsError(f"voxel_noise is {self.voxel_noise}, but must be 0 or more")
 
 
 NOTHING = Augment(flip=0.0, pauses=0.0, hot_pixels=0.0, voxel_noise=0.0)
@@ -321,28 +322,7 @@ def batches(
     and where all are too short, while iterating for what is damaged. Files that are too short are
     left out, with a warning.
     """
-    facts = [_facts(path) for path in files]
-    for path, _, height, width in facts:
-        if min(height, width) < crop:
-            raise RecordingError(
-                f"{path}: its images have {width}x{height} pixels, fewer than the crop of "
-                f"{crop}x{crop}: choose a smaller --crop"
-            )
-    total = chain * windows
-    examples = [entry for entry in facts for _ in range((entry.images - 1) // total)]
-    if not examples:
-        longest = max(facts, key=lambda entry: entry.images)
-        raise RecordingError(
-            f"{longest.path}: has {longest.images} images, the most of {len(facts)} files, but "
-            f"{total} windows in a row need {total + 1}: ask for fewer --windows or a shorter "
-            "--chain"
-        )
-    short = sum(entry.images <= total for entry in facts)
-    if short:
-        logger.warning(
-            "%d of %d files are left out: they have fewer than %d images",
-            short, len(facts), total + 1,
-        )  # fmt: skip
+    examples = _long_enough(files, crop, chain * windows)
     index = cache(_index)  # of all files: 2 kB each
     order = grain.MapDataset.range(len(examples)).shuffle(seed=seed).repeat()
 
@@ -375,6 +355,32 @@ def batches(
         .to_iter_dataset(grain.ReadOptions(num_threads=THREADS, prefetch_buffer_size=AHEAD))
         .map(partial(_simulation, jax.random.key(seed), augment=augment))
     )
+
+
+def _long_enough(files: Sequence[Path], crop: int, total: int) -> list[Facts]:
+    """Each file as often as so many windows in a row fit into it. Raises RecordingError."""
+    facts = [_facts(path) for path in files]
+    for path, _, height, width in facts:
+        if min(height, width) < crop:
+            raise RecordingError(
+                f"{path}: its images have {width}x{height} pixels, fewer than the crop of "
+                f"{crop}x{crop}: choose a smaller --crop"
+            )
+    examples = [entry for entry in facts for _ in range((entry.images - 1) // total)]
+    if not examples:
+        longest = max(facts, key=lambda entry: entry.images)
+        raise RecordingError(
+            f"{longest.path}: has {longest.images} images, the most of {len(facts)} files, but "
+            f"{total} windows in a row need {total + 1}: ask for fewer --windows or a shorter "
+            "--chain"
+        )
+    short = sum(entry.images <= total for entry in facts)
+    if short:
+        logger.warning(
+            "%d of %d files are left out: they have fewer than %d images",
+            short, len(facts), total + 1,
+        )  # fmt: skip
+    return examples
 
 
 @partial(jax.jit, static_argnames="augment")

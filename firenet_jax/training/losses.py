@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
+from firenet_jax.errors import SettingsError
 from firenet_jax.evaluation import metrics
 
 
@@ -68,7 +69,7 @@ class Loss:
     def __post_init__(self):
         for name in (*DISTANCES, "detail", "lambda_tc", "l0", "L"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}, but must be 0 or more")
+                raise SettingsError(f"{name} is {getattr(self, name)}, but must be 0 or more")
 
 
 STILL = 0.3  # pixels by which nothing moves more before an image whose detail counts

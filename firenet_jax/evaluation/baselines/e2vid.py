@@ -22,15 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import unflatten_dict
 
-from firenet_jax.network import BINS, ResidualBlock
+from firenet_jax.errors import CheckpointError
+from firenet_jax.events import BINS
+from firenet_jax.network import ResidualBlock
 from firenet_jax.reconstruction import padding
-from firenet_jax.storage.pytorch_file import (
-    CheckpointError,
-    identify,
-    read_state_dict,
-    refuse_unused,
-    take,
-)
+from firenet_jax.storage.pytorch_file import identify, read_state_dict, refuse_unused, take
 
 STRIDE = 8  # of the three encoders together
 EPSILON = 1e-5  # PyTorch's default in a batch normalisation

@@ -1,0 +1,35 @@
+"""Words and numbers of a command line -> what they mean, or a SettingsError."""
+
+import math
+
+from firenet_jax.errors import SettingsError
+
+LONGEST_SIDE = 2**15  # pixels of a sensor's side at most: coordinates are int16
+
+
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    """ "240x180" -> (height, width) = (180, 240); None stays None. Raises SettingsError."""
+    if text is None:
+        return None
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise SettingsError(f"sensor size {text!r}: expected WIDTHxHEIGHT, such as 240x180")
+    if max(int(width), int(height)) > LONGEST_SIDE:
+        raise SettingsError(f"sensor size {text}: a side is at most {LONGEST_SIDE} pixels")
+    return int(height), int(width)
+
+
+def check_seed(seed: int) -> None:
+    """Raises SettingsError unless jax, numpy and grain all take it."""
+    if not 0 <= seed < 2**32:
+        raise SettingsError(f"seed is {seed}, but must be 0 or more, and less than 2^32")
+
+
+def check_range(name: str, bounds: tuple[float, float]) -> None:
+    """Raises SettingsError unless a number can be drawn log-uniformly between these."""
+    least, greatest = bounds
+    if not (0 < least <= greatest and math.isfinite(greatest)):
+        raise SettingsError(
+            f"{name} is {least:g} {greatest:g}, but is drawn log-uniformly: "
+            "both must be more than 0, the least first"
+        )

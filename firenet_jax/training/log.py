@@ -1,0 +1,89 @@
+"""Losses and pictures of a run -> log.jsonl, TensorBoard, png files, weights.
+
+The first process writes; the others only read what is there. A log goes on after a checkpoint:
+lines that came after it are dropped.
+"""
+
+import contextlib
+import json
+import math
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
+from tensorboardX import SummaryWriter
+
+from firenet_jax.checkpoint import save_weights
+from firenet_jax.devices import is_first
+from firenet_jax.network import Weights
+from firenet_jax.pictures import event_pictures
+from firenet_jax.storage.files import write_text
+
+
+class Log:
+    """A run's record: log.jsonl, TensorBoard, pictures, weights; written by the first process.
+
+    Lines beyond the checkpoint from which a run goes on are dropped.
+    """
+
+    def __init__(self, folder: Path, step: int):
+        self.path, self.start = folder / "log.jsonl", time.monotonic()
+        self.entries = [entry for entry in _entries(self.path) if entry["step"] <= step]
+        self.board = None
+        if is_first():
+            write_text(self.path, "".join(json.dumps(entry) + "\n" for entry in self.entries))
+            self.board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
+
+    def write(self, step: int, kind: str, values: dict) -> dict[str, float]:
+        values = {name: float(value) for name, value in values.items()}
+        entry = {"step": step, "kind": kind, **values, "seconds": time.monotonic() - self.start}
+        if self.board is not None:
+            with self.path.open("a") as file:
+                file.write(json.dumps(entry) + "\n")
+            for name, value in values.items():
+                self.board.add_scalar(f"{kind}/{name}", value, step)
+        return values
+
+    def show(self, step: int, pictures: tuple[jax.Array, jax.Array, jax.Array]) -> None:
+        """Three windows of `validate`'s pictures: events, image, truth, one window a row."""
+        if self.board is None:
+            return
+        images, truths, tensors = pictures
+        chosen = [len(images) * k // 3 - 1 for k in (1, 2, 3)]
+        grey = np.asarray(jnp.concatenate([images, truths], -1)[np.array(chosen)])
+        grey = np.round(255 * np.clip(grey, 0, 1)).astype(np.uint8)[..., None]
+        events = np.asarray(event_pictures(tensors[np.array(chosen)]))
+        sheet = np.concatenate([events, np.repeat(grey, 3, -1)], 2)  # (3, H, 3 W, 3)
+        sheet = sheet.reshape(-1, *sheet.shape[2:])
+        (self.path.parent / "pictures").mkdir(exist_ok=True)
+        Image.fromarray(sheet).save(self.path.parent / "pictures" / f"step_{step:07d}.png")
+        self.board.add_image("validation", sheet, step, dataformats="HWC")
+
+    def keep(self, name: str, weights: Weights) -> None:
+        if self.board is not None:
+            save_weights(self.path.parent / name, weights)
+
+    def best(self) -> float:
+        """The least validation loss so far."""
+        losses = [entry["loss"] for entry in self.entries if entry.get("kind") == "validation"]
+        return min(filter(math.isfinite, losses), default=math.inf)
+
+    def close(self) -> None:
+        if self.board is not None:
+            self.board.close()
+
+
+def _entries(path: Path) -> Iterator[dict]:
+    """Lines of a log, but what was half written when a run was killed, and what is no entry."""
+    for line in path.read_bytes().splitlines() if path.exists() else []:
+        with contextlib.suppress(ValueError, TypeError, RecursionError, OverflowError):
+            entry = json.loads(line)
+            if not (isinstance(entry, dict) and type(entry.get("step")) is int):
+                continue
+            if entry.get("kind") == "validation":
+                entry["loss"] = float(entry.get("loss", "nothing"))
+            yield entry
