@@ -20,7 +20,7 @@ from firenet_jax import cli
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Recording, concatenate
 from firenet_jax.live import sources
-from firenet_jax.live.engine import Arrived, Figures, Waiting, pictures, sound, windows
+from firenet_jax.live.engine import Arrived, Figures, Limits, Waiting, pictures, sound, windows
 from firenet_jax.live.page import Board, serve
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pictures import Display
@@ -258,10 +258,8 @@ def weights():
 def test_pictures_are_those_of_the_batch_program(weights):
     parts = [some_events(84, last=10_000, start=10_000 * k, seed=k) for k in range(5)]
     figures = Figures()
-    found = pictures(
-        iter(parts), weights, height=HEIGHT, width=WIDTH, count=84, longest=10**6,
-        figures=figures, behind=10,
-    )  # fmt: skip
+    source = sources.Source("parts", HEIGHT, WIDTH, iter(parts))
+    found = pictures(source, weights, Limits(84, 10**6, 10), figures)
     found = np.stack(list(found))
     _, expected = events_to_pictures(
         weights, initial_session(1, HEIGHT, WIDTH, Network()), pack([[part] for part in parts]),

@@ -15,7 +15,7 @@ from firenet_jax.checkpoint import load_weights
 from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.events import counted
 from firenet_jax.live import sources
-from firenet_jax.live.engine import Figures, pictures
+from firenet_jax.live.engine import Figures, Limits, pictures
 from firenet_jax.live.page import Board, serve
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
@@ -132,16 +132,14 @@ def run(settings: Live) -> None:
     print(f"{source.name}, {size}: open {address} to watch, Ctrl-C ends", flush=True)
     count = Windows(events_per_pixel=settings.events_per_pixel).count(source.height * source.width)
     begun = time.monotonic()
-    arrivals = source.arrivals
     if settings.seconds is not None:
-        arrivals = itertools.takewhile(
-            lambda _: time.monotonic() - begun < settings.seconds, arrivals
+        source = source._replace(
+            arrivals=itertools.takewhile(
+                lambda _: time.monotonic() - begun < settings.seconds, source.arrivals
+            )
         )
-    shown = pictures(
-        arrivals, weights, height=source.height, width=source.width, count=count,
-        longest=round(1000 * settings.longest), figures=figures, behind=settings.behind,
-        settings=settings.display,
-    )  # fmt: skip
+    limits = Limits(count, round(1000 * settings.longest), settings.behind)
+    shown = pictures(source, weights, limits, figures, settings.display)
     try:
         for picture in shown:
             board.hang(picture)

@@ -19,6 +19,7 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, concatenate
+from firenet_jax.live.sources import Source
 from firenet_jax.network import Weights
 from firenet_jax.pictures import Display
 from firenet_jax.reconstruction import Network, events_to_pictures, initial_session
@@ -26,6 +27,14 @@ from firenet_jax.tensors import capacity, pack
 
 REMEMBERED = 2000  # latencies, of which median and 95th percentile are told
 BAD = 1000  # events, of which most may not be bad at the start
+
+
+class Limits(NamedTuple):
+    """Of windows."""
+
+    count: int  # events in one
+    longest: int  # microseconds of one
+    behind: int = 2  # that may wait
 
 
 class Arrived(NamedTuple):
@@ -163,22 +172,18 @@ class Waiting:
 
 
 def pictures(
-    arrivals: Iterator[Events],
+    source: Source,
     weights: Weights,
-    *,
-    height: int,
-    width: int,
-    count: int,
-    longest: int,
+    limits: Limits,
     figures: Figures,
-    behind: int = 2,
     settings: Display = Display(),
 ) -> Iterator[np.ndarray]:
-    """Arrivals -> pictures (H, 2 W, 3) uint8, the events beside the reconstruction.
+    """A source -> pictures (H, 2 W, 3) uint8, the events beside the reconstruction.
 
-    count, longest: of a window, in events and microseconds. behind: windows that may wait.
+    figures: what is measured is noted down there.
     """
-    size = capacity(count)
+    height, width = source.height, source.width
+    size = capacity(limits.count)
     session = initial_session(1, height, width, Network())
     valid = jnp.ones((1, 1), bool)
 
@@ -192,8 +197,9 @@ def pictures(
 
     jax.block_until_ready(compute(session, Events.empty()))  # compiled before the first event
 
-    waiting = Waiting(behind, figures)
-    cut = windows(sound(arrivals, height, width, figures), count, longest)
+    waiting = Waiting(limits.behind, figures)
+    arrivals = sound(source.arrivals, height, width, figures)
+    cut = windows(arrivals, limits.count, limits.longest)
     reading = threading.Thread(target=waiting.fill, args=(cut,), daemon=True)
     reading.start()
     try:
