@@ -57,7 +57,7 @@ def with_little_room(folder, *lines):
     """
     ran = subprocess.run(
         [sys.executable, "-c", LIMITED, json.dumps(lines)],
-        cwd=folder, capture_output=True, text=True, timeout=600,
+        cwd=folder, capture_output=True, text=True, timeout=900,
         # The limit holds for the compiled programs that tests share too: these are only read.
         env=os.environ | {"JAX_PLATFORMS": "cpu"}
         | {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "1e9"},
