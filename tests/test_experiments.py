@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from processes import COMPILES_SOON
 from test_pipeline import write_recording
 
 import firenet_jax as fj
@@ -125,6 +126,6 @@ def test_runs(name, tmp_path):
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        env=os.environ | {"XLA_FLAGS": "--xla_backend_optimization_level=0"},  # compiles sooner
+        env=os.environ | {"XLA_FLAGS": COMPILES_SOON},
     )
     assert done.returncode == 0, done.stderr[-2000:]
