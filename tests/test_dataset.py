@@ -31,10 +31,14 @@ from firenet_jax.warp import warp
 HEIGHT, WIDTH = 24, 32
 
 
+@pytest.fixture(scope="module")
+def textures():
+    return load_textures(count=4, size=64, procedural=1.0)
+
+
 @pytest.fixture(autouse=True)
-def few_textures(monkeypatch):
+def few_textures(monkeypatch, textures):
     """Textures take longer to draw than the sequences of a test."""
-    textures = load_textures(count=4, size=64, procedural=1.0)
     monkeypatch.setattr(dataset, "load_textures", lambda *_: textures)
     dataset._textures.cache_clear()
     yield

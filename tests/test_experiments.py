@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from processes import COMPILES_SOON
 from test_pipeline import write_recording
 
 import firenet_jax as fj
@@ -59,7 +60,7 @@ SMALLER = {
     "compare_optimisers": {
         "textures=512,": "textures=4,",
         "crop=64,": "crop=32,",
-        "windows=16,": "windows=4,",
+        "windows=16,": "windows=12,",
     },
     "endurance": {"ROUNDS = 40": "ROUNDS = 2"},
     "figure4_high_speed": {
@@ -67,7 +68,11 @@ SMALLER = {
         "EVENTS, SPEED, MOMENTS = 50_000": "EVENTS, SPEED, MOMENTS = 2_000",
     },
     "figure6_limitations": {"SPEEDS = (50.0, 600.0, 1500.0)": "SPEEDS = (50.0, 1500.0)"},
-    "figures": {"HEIGHT, WIDTH = 180, 240": "HEIGHT, WIDTH = 90, 120"},
+    "figures": {
+        "HEIGHT, WIDTH = 180, 240": "HEIGHT, WIDTH = 90, 120",
+        '    "slow": (50.0, False),\n': "",
+        '    "fast, faulty sensor": (250.0, True),\n': "",
+    },
     "memory": {"HEIGHT, WIDTH = 480, 640": "HEIGHT, WIDTH = 48, 64"},
     "scaling": {
         'POINT = {"width": 240, "height": 180,': 'POINT = {"width": 80, "height": 60,',
@@ -87,6 +92,7 @@ SMALLER = {
         "SECONDS = 1.0": "SECONDS = 0.3",
         "count=64, size=320": "count=4, size=96",
     },
+    "train_default": {"SceneSettings(objects=2, pause=0.2)": "SceneSettings(objects=0)"},
     "voxelisation": {"HEIGHT, WIDTH, BINS = 480, 640": "HEIGHT, WIDTH, BINS = 48, 64"},
 }
 
@@ -121,6 +127,6 @@ def test_runs(name, tmp_path):
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        env=os.environ | {"XLA_FLAGS": "--xla_backend_optimization_level=0"},  # compiles sooner
+        env=os.environ | {"XLA_FLAGS": COMPILES_SOON},
     )
     assert done.returncode == 0, done.stderr[-2000:]

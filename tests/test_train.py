@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from processes import finish, start, together
+from processes import COMPILES_SOON, finish, start, together
 
 from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.commands.simulate import Picture, write_sequence
@@ -103,9 +103,9 @@ run(Train(Path(folder), batch=4, crop=32, windows=3, textures=4, log_every=1,
 @pytest.mark.slow
 def test_four_devices_and_two_processes_learn_what_one_device_learns(tmp_path):
     chain = 2
-    finish(start(TOGETHER, tmp_path / "one", chain))
-    finish(start(TOGETHER, tmp_path / "four", chain, devices=4))
-    together(TOGETHER, tmp_path / "two", chain)
+    finish(start(TOGETHER, tmp_path / "one", chain, flags=COMPILES_SOON))
+    finish(start(TOGETHER, tmp_path / "four", chain, devices=4, flags=COMPILES_SOON))
+    together(TOGETHER, tmp_path / "two", chain, flags=COMPILES_SOON)
 
     one, four, two = (entries(tmp_path / name) for name in ("one", "four", "two"))
     assert len(one) == 11
