@@ -347,6 +347,16 @@ def test_processes_that_share_recordings_know_what_others_have_done(tmp_path, we
     assert {path.name for path in (tmp_path / "out").iterdir()} == set("abc")
 
 
+def test_the_share_of_a_process_is_what_its_launcher_says(tmp_path, weights, monkeypatch):
+    paths = tuple(write_recording(tmp_path / f"{name}.txt", 300, seed=3) for name in "abc")
+    monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "2")
+    for rank, names in (("1", ["b"]), ("0", ["a", "c"])):
+        monkeypatch.setenv("SLURM_PROCID", rank)
+        made = run(settings(weights, paths, tmp_path / "out"))
+        assert [path.name for path in made] == names
+    assert {path.name for path in (tmp_path / "out").iterdir()} == set("abc")
+
+
 def test_what_a_killed_run_left_of_a_video_is_replaced(tmp_path, weights):
     recording = write_recording(tmp_path / "a.txt")
     (tmp_path / "a.partial.mp4").write_bytes(b"half")

@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from firenet_jax import filters
 from firenet_jax.checkpoint import load_weights
-from firenet_jax.devices import BATCH, EVERYWHERE, in_a_row, shared
+from firenet_jax.devices import BATCH, EVERYWHERE, in_a_row, share, shared
 from firenet_jax.errors import RecordingError, logger
 from firenet_jax.events import Events, Recording, counted, parse_size, rate_in_words, until_damage
 from firenet_jax.network import Weights
@@ -123,7 +123,8 @@ class Reconstruct:
     overwrite: bool = False
     """Replace an output that exists."""
     processes: int | None = None
-    """How many processes, on this machine or on many, deal the recordings out among them."""
+    """How many processes, on this machine or on many, deal the recordings out among them; where
+    nothing is said, those that srun or mpirun has started."""
     process: int | None = None
     """Which one this is, from 0."""
 
@@ -143,10 +144,7 @@ class Reconstruct:
         if not self.recordings:
             raise ValueError("no recording: name one or more files or folders")
         filters.check_span(self.start, self.stop)
-        if (self.process is None) != (self.processes is None):
-            raise ValueError("several processes need both of --processes and --process")
-        if self.process is not None and not 0 <= self.process < self.processes:
-            raise ValueError(f"process is {self.process}, but counts from 0 to processes - 1")
+        share(self.process, self.processes)
 
 
 class Job(NamedTuple):
@@ -212,7 +210,8 @@ def run(settings: Reconstruct) -> list[Path]:
         check_screen()
     # Recordings have nothing to do with each other, so processes need not know of each other:
     # as one of JAX's own processes, one that is done or dies would take the others with it.
-    mine = slice(settings.process or 0, None, settings.processes or 1)
+    process, processes = share(settings.process, settings.processes)
+    mine = slice(process, None, processes)
     planned = plan(settings.recordings, settings.output)
     outputs = planned[mine]
     if not outputs:

@@ -14,6 +14,7 @@ period: times the period, what was at x - d(x) in the last image is at x now (ba
 A file appears under its name when it is whole, so a run that was interrupted goes on where it was.
 """
 
+import contextlib
 import importlib.metadata
 import io
 import itertools
@@ -25,6 +26,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
+from time import sleep
 from typing import Annotated, NamedTuple
 
 import av
@@ -33,6 +35,7 @@ import jax
 import numpy as np
 import tyro
 
+from firenet_jax.devices import share
 from firenet_jax.errors import OutputError, PictureError, SettingsError
 from firenet_jax.events import Events, concatenate
 from firenet_jax.settings import check_seed, parse_size
@@ -72,7 +75,10 @@ POOL = 32  # sequences that choose from the same textures, and how many these ar
 TEXTURES, TEXTURE_SIZE = 64, 320
 FEW = 8  # sequences after which their mean size is that of all, more or less
 LONGEST_SCENE = 60.0  # seconds; a scene's clock is float32, which by then ticks in 4 us
+PATIENCE = 600  # seconds that processes wait for the first one
 CLIP_SUFFIXES = (".h5", ".hdf5")
+# on which no sequence depends
+ELSEWHERE = ("output", "sequences", "validation", "video", "overwrite", "processes", "process")
 OF_SCENES = ("sequences", "validation", "seconds", "fps", "images", "scene")  # not of a video
 
 
@@ -112,6 +118,11 @@ class Simulate:
     that are given stay as given (--noise 0 0: all but noise)."""
     overwrite: bool = False
     """With --video: replace an output that exists."""
+    processes: int | None = None
+    """How many processes, on this machine or on many, deal the sequences out among them; where
+    nothing is said, those that srun or mpirun has started."""
+    process: int | None = None
+    """Which one this is, from 0."""
     scene: SceneSettings = SceneSettings()
     sensor: SensorSettings = SensorSettings()
 
@@ -132,6 +143,7 @@ class Simulate:
             )
         check_seed(self.seed)
         parse_size(self.sensor_size)
+        share(self.process, self.processes)
         if self.video is not None:
             idle = [name for name in OF_SCENES if getattr(self, name) != getattr(Simulate, name)]
             if idle:
@@ -344,21 +356,44 @@ def _gathered(chunks: Iterable[Events]) -> Iterator[Events]:
 def run(settings: Simulate) -> list[Path]:
     """Does what the settings say; returns the files, those of an earlier run included. Raises
     OutputError or ValueError with a message of one sentence."""
-    if settings.video is not None:
-        return [simulate_clip(settings)]
+    process, processes = share(settings.process, settings.processes)
+    if settings.video is not None:  # which is not dealt out
+        return [] if process else [simulate_clip(settings)]
     height, width = parse_size(settings.sensor_size or "240x180")
     folder = settings.output
     if folder.is_file() or folder.suffix in CLIP_SUFFIXES:
         raise OutputError(f"{folder}: sequences go into a folder: choose another name")
-    with alone_in(folder):
-        open_folder(settings)
-        return write_sequences(settings, height, width)
+    if processes == 1:
+        with alone_in(folder):
+            open_folder(settings)
+            return write_sequences(settings, height, width)
+    if process:
+        _wait_for(folder / "settings.json")
+    open_folder(settings)
+    mine = folder / "running" / f"{process} of {processes}"
+    with alone_in(mine):
+        written = write_sequences(settings, height, width, process, processes)
+    with contextlib.suppress(OSError):  # others are still there
+        mine.rmdir()
+        mine.parent.rmdir()
+    return written
 
 
-def write_sequences(settings: Simulate, height: int, width: int) -> list[Path]:
-    """Writes those that are not in the folder yet."""
-    for left in settings.output.glob("*/*.partial.h5"):  # of a run that was killed
-        left.unlink()
+def _wait_for(path: Path) -> None:
+    """The first of several processes begins the folder. Raises OutputError if it does not."""
+    for _ in range(10 * PATIENCE):
+        if path.is_file():
+            return
+        sleep(0.1)
+    raise OutputError(
+        f"{path} is not there after {PATIENCE} s: start process 0 too, and look at it"
+    )
+
+
+def write_sequences(
+    settings: Simulate, height: int, width: int, process: int = 0, processes: int = 1
+) -> list[Path]:
+    """Writes those that are not in the folder yet; of several processes, this one's share."""
     sensor = with_faults(settings.sensor) if settings.faults else settings.sensor
     record = describe(settings)
     held_out = settings.sequences // 20 if settings.validation is None else settings.validation
@@ -375,6 +410,11 @@ def write_sequences(settings: Simulate, height: int, width: int) -> list[Path]:
                 f"{settings.output / name} holds {there} sequences already, but these settings "
                 f"want {count}: ask for as many --sequences and --validation or more"
             )
+    work = work[process::processes]
+    # Of a run that was killed; other processes are at work on theirs.
+    own = [partial_name(path) for path, *_ in work]
+    for left in own if processes > 1 else settings.output.glob("*/*.partial.h5"):
+        left.unlink(missing_ok=True)
     missing = [entry for entry in work if not entry[0].exists()]
     events = used = 0
     there = len(work) - len(missing)
@@ -473,7 +513,7 @@ def describe(settings: Simulate) -> dict:
     """All that a sequence depends on, apart from its number; ready for JSON."""
     return recorded(
         settings,
-        but=("output", "sequences", "validation", "video", "overwrite"),
+        but=ELSEWHERE,
         images=None if settings.images is None else settings.images.resolve(),
         sensor_size=settings.sensor_size or "240x180",
         version=importlib.metadata.version("firenet-jax"),

@@ -92,7 +92,8 @@ class Train:
     save_every: float = 120.0
     """Seconds between two checkpoints, which are made after a line of the log."""
     coordinator: str | None = None
-    """host:port of process 0, where several processes train together; start each with this."""
+    """host:port of process 0, where several processes train together; start each with this. Those
+    that srun or Open MPI 4 has started find each other."""
     processes: int | None = None
     """How many processes."""
     process: int | None = None
