@@ -16,8 +16,8 @@ from PIL import Image
 from firenet_jax.commands.reconstruct import Reconstruct, run
 
 OUT = Path(__file__).parents[1] / "docs" / "events_to_video.gif"
-HEIGHT, GAP, MOST = 180, 4, 1_000_000
-GREYS = (128, 96, 64, 48, 32, 24, 16)
+HEIGHT, GAP, MOST = 160, 4, 1_000_000
+GREYS = (128, 96, 80, 64, 48, 40, 32, 24, 16)
 
 
 def video(recording: Path, weights: Path | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -308,7 +308,7 @@ def test_pictures_of_other_settings_are_not_shown_beside_a_gap(folder, tmp_path,
     monkeypatch.setattr(evaluate, "evaluate", without_mr)
     monkeypatch.setattr(evaluate.report, "page", page)
     run(settings(folder, tmp_path / "out", overwrite=True, equalise="global", **shared))
-    assert [sequence.titles for sequence in shown] == [["frame", "hf"]]
+    assert [sequence.titles for sequence in shown] == [["events", "frame", "hf"]]
 
 
 # ---- What counts
