@@ -23,7 +23,10 @@ def join(coordinator: str | None, processes: int | None, process: int | None) ->
     if coordinator is not None:
         # Else SIGTERM would only be noted down, for programs that ask for it, and ended by nothing.
         jax.config.update("jax_enable_preemption_service", False)
-        jax.distributed.initialize(coordinator, processes, process)
+        try:
+            jax.distributed.initialize(coordinator, processes, process)
+        except ValueError as error:
+            raise SettingsError(f"coordinator {coordinator!r}: {error}") from error
 
 
 def is_first() -> bool:
@@ -38,7 +41,7 @@ def check_processes(coordinator: str | None, processes: int | None, process: int
         raise SettingsError("several processes need all of coordinator, processes and process")
 
 
-def device_mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:
+def device_mesh(devices: Sequence | None = None) -> Mesh:
     """These devices, by default all of all processes."""
     devices = jax.devices() if devices is None else devices
     return jax.make_mesh((len(devices),), ("devices",), (AxisType.Auto,), devices=devices)

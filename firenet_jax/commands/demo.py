@@ -117,7 +117,7 @@ def run(settings: Demo) -> dict[str, float]:
     finally:
         shown.close()
     values = (errors / (count - warm_up)).tolist()
-    result = dict(zip(("mse", "ssim", "temporal_error"), values, strict=True))
+    result: dict[str, float] = dict(zip(("mse", "ssim", "temporal_error"), values, strict=True))
     if count == 1:  # a first picture has no predecessor
         del result["temporal_error"]
     temporal = f", temporal error {result['temporal_error']:.4f}" if count > 1 else ""

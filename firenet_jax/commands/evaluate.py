@@ -227,7 +227,7 @@ def compute(
 ) -> None:
     """What is neither done nor a gap is computed, written, and added to one of them."""
     work = [key for key in records if key not in done and key not in gaps]
-    by_name = {method.name: method for method in methods}
+    by_name = {method.name: method for method in methods if isinstance(method, Method)}
     total = sum(plans[name].last for name, _ in work)
     with bar(total, "frames", smoothing=0.1) as progress:
         for name, method in work:
@@ -333,7 +333,7 @@ def interval(path: Path, settings: Evaluate) -> tuple[float, float]:
 def first_event(recording: Recording, times: np.ndarray) -> int:
     """Its time. Raises Gap where the events do not reach from before the last frame to after the
     first."""
-    first = last = None
+    first, last = None, 0
     for events in recording.events():
         first = int(events.t[0]) if first is None else first
         last = int(events.t[-1])
@@ -351,7 +351,7 @@ def first_event(recording: Recording, times: np.ndarray) -> int:
 
 def windows_of(plan: Plan, settings: Evaluate) -> Iterator[Window]:
     recording = plan.recording
-    frames = Frames(plan.times, recording.frames.read)
+    frames = Frames(plan.times, plan.frames.read)
     later = (e.select(slice(np.searchsorted(e.t, plan.begin), None)) for e in recording.events())
     recording = dataclasses.replace(recording, frames=frames)
     return cut(recording, settings.windows, filter(len, later), plan.begin)
@@ -360,7 +360,7 @@ def windows_of(plan: Plan, settings: Evaluate) -> Iterator[Window]:
 def displacement(plan: Plan, place: int) -> np.ndarray | None:
     """(H, W, 2) pixels since the frame before, where the recording has flow and the frame before
     is used too."""
-    flow, number = plan.recording.frames.flow, int(plan.numbers[place])
+    flow, number = plan.frames.flow, int(plan.numbers[place])
     if flow is None or place == 0 or number != plan.numbers[place - 1] + 1:
         return None
     velocity = flow(number)
@@ -403,7 +403,7 @@ def evaluate(
     try:
         for place, image in matched(predictions(), plan.times, tolerance):
             if plan.first <= place < plan.last:
-                truth = plan.recording.frames.read(int(plan.numbers[place]))
+                truth = plan.frames.read(int(plan.numbers[place]))
                 if truth.shape != image.shape:
                     raise Gap(f"frame {plan.numbers[place] + 1} is of another size: {truth.shape}")
                 waiting.append(Comparison(place, image, truth, displacement(plan, place)))
@@ -561,7 +561,7 @@ def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
 
     def truth(number: int) -> np.ndarray:
         if number not in truths:
-            frame = plan.recording.frames.read(number).astype(np.float32) / 255
+            frame = plan.frames.read(number).astype(np.float32) / 255
             truths[number] = to_8_bit(equalise(frame, settings.equalise))
         return truths[number]
 
@@ -573,7 +573,7 @@ def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
             images = [f[kind][p] for f, p in zip(kept.values(), places, strict=True)]
             yield number, [truth(number), *images]
 
-    times = plan.recording.frames.times
+    times = plan.frames.times
     stills = [
         (f"{(int(times[number]) - plan.origin) / 1e6:.3f} s", images)
         for number, images in side_by_side("stills")

@@ -346,7 +346,7 @@ def run(settings: Simulate) -> list[Path]:
     """Does what the settings say; returns the files, those of an earlier run included. Raises
     OutputError or ValueError with a message of one sentence."""
     if settings.video is not None:
-        return [simulate_clip(settings)]
+        return [simulate_clip(settings, settings.video)]
     height, width = parse_size(settings.sensor_size or "240x180")
     folder = settings.output
     if folder.is_file() or folder.suffix in CLIP_SUFFIXES:
@@ -521,9 +521,9 @@ def _check_room(folder: Path, needed: float) -> None:
 # ---- Video files
 
 
-def simulate_clip(settings: Simulate) -> Path:
+def simulate_clip(settings: Simulate, clip: Path) -> Path:
     """A video file -> events and its pictures, as one file; returns its name."""
-    path, clip = settings.output, settings.video
+    path = settings.output
     if path.suffix not in CLIP_SUFFIXES:
         raise OutputError(f"{path}: with --video the output is one file: name it {path}.h5")
     if path.is_dir() or (path.exists() and not settings.overwrite):

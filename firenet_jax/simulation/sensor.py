@@ -376,7 +376,7 @@ def event_list(sensor: Sensor, renderings: Iterable[tuple[int, np.ndarray]]) -> 
             continue
         duration = time - previous
         if not 0 < duration <= LONGEST:
-            raise ValueError(
+            raise SettingsError(
                 f"renderings at {previous} and {time} us: each must come after the last, by at "
                 f"most {LONGEST} us"
             )
