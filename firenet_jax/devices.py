@@ -35,7 +35,7 @@ def is_first() -> bool:
 
 
 def check_processes(coordinator: str | None, processes: int | None, process: int | None) -> None:
-    """Raises ValueError unless all of the three are given, or none."""
+    """Raises SettingsError unless all of the three are given, or none."""
     together = [coordinator, processes, process]
     if None in together and together != [None] * 3:
         raise SettingsError("several processes need all of coordinator, processes and process")

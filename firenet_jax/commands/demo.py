@@ -91,7 +91,7 @@ class Shown(NamedTuple):
 
 def run(settings: Demo) -> dict[str, float]:
     """Does what the settings say; returns the numbers it prints. Raises CheckpointError,
-    OutputError or ValueError with a message of one sentence."""
+    OutputError or SettingsError with a message of one sentence."""
     weights = load_weights(settings.weights)
     output = followed(settings.output)
     check_output(output, settings.overwrite)

@@ -169,7 +169,7 @@ class Evaluate:
 
 def run(settings: Evaluate) -> dict:
     """Does what the settings say; returns what results.json holds. Raises RecordingError,
-    CheckpointError, OutputError or ValueError with a message of one sentence."""
+    CheckpointError, OutputError or SettingsError with a message of one sentence."""
     sequences = find_sequences(settings.data)
     methods = load(
         settings.method_names,

@@ -344,7 +344,7 @@ def _gathered(chunks: Iterable[Events]) -> Iterator[Events]:
 
 def run(settings: Simulate) -> list[Path]:
     """Does what the settings say; returns the files, those of an earlier run included. Raises
-    OutputError or ValueError with a message of one sentence."""
+    a FirenetError with a message of one sentence."""
     if settings.video is not None:
         return [simulate_clip(settings, settings.video)]
     height, width = parse_size(settings.sensor_size or "240x180")
@@ -565,7 +565,7 @@ def simulate_clip(settings: Simulate, clip: Path) -> Path:
 def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Picture]:
     """A video file -> its pictures in grey, times from the first; scaled to (height, width).
 
-    Raises ValueError for what cannot be read, or whose times stand still or leave gaps.
+    Raises PictureError for what cannot be read, or whose times stand still or leave gaps.
     """
     first = last = None
     try:

@@ -555,7 +555,8 @@ def event_correlation(image: jax.Array, votes: jax.Array) -> jax.Array:
     make it smaller; contrast does not change it, nor does a negative. Two numbers are fitted to a
     block, so an image that has nothing to do with the events has more than 0: compare with what
     the same votes give when they are turned by 180 degrees. What is beyond the last whole block
-    does not count. 0 where there are no events. Raises ValueError for images smaller than a block.
+    does not count. 0 where there are no events.
+    Raises SettingsError for images smaller than a block.
     """
     image, votes = _compared(image, votes)
     rows, columns = (side // BLOCK for side in image.shape[-2:])
