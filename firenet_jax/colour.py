@@ -26,7 +26,7 @@ WHITE = XYZ.sum(1)
 
 
 def check_sides(height: int, width: int) -> None:
-    """Raises ValueError unless both sides hold the mosaic a whole number of times."""
+    """Raises SettingsError unless both sides hold the mosaic a whole number of times."""
     if height % 2 or width % 2:
         raise SettingsError(
             f"{width}x{height} cannot be a colour sensor, whose mosaic has even sides: leave out "

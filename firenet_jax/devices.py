@@ -104,7 +104,7 @@ def check_processes(coordinator: str | None, processes: int | None, process: int
         raise SettingsError("several processes need all of coordinator, processes and process")
 
 
-def device_mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:
+def device_mesh(devices: Sequence | None = None) -> Mesh:
     """These devices, by default all of all processes."""
     devices = jax.devices() if devices is None else devices
     return jax.make_mesh((len(devices),), ("devices",), (AxisType.Auto,), devices=devices)

@@ -6,10 +6,10 @@ seconds lose microseconds after 16 s. A recording is a stream of `Events` chunks
 """
 
 import bisect
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import numpy as np
 
@@ -73,14 +73,17 @@ class Rows:
         return len(self.events)
 
 
-def concatenate(chunks: "list[Events] | list[Events | Rows]") -> "Events | Rows":
+@overload
+def concatenate(chunks: Sequence[Events]) -> Events: ...
+@overload
+def concatenate(chunks: Sequence[Events | Rows]) -> Events | Rows: ...
+def concatenate(chunks: Sequence[Events | Rows]) -> Events | Rows:
     """Chunks -> one chunk; without copying when there is only one."""
     if len(chunks) == 1:
         return chunks[0]
     errors = [chunk.error for chunk in chunks if isinstance(chunk, Rows)]
     if errors:
-        whole = (isinstance(chunk, Events) for chunk in chunks)
-        masks = [np.zeros(len(c), bool) if w else c.bad for c, w in zip(chunks, whole, strict=True)]
+        masks = [c.bad if isinstance(c, Rows) else np.zeros(len(c), bool) for c in chunks]
         events = [c if isinstance(c, Events) else c.events for c in chunks]
         return Rows(concatenate(events), np.concatenate(masks), errors[0])
     columns = ([getattr(chunk, name) for chunk in chunks] for name in "txyp")

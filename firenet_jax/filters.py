@@ -16,7 +16,7 @@ from firenet_jax.storage.files import check_readable
 
 
 def check_span(start: float | None, stop: float | None) -> None:
-    """Raises ValueError unless these seconds, None for no bound, are a part of a recording."""
+    """Raises SettingsError unless these seconds, None for no bound, are a part of a recording."""
     for name, value in (("start", start), ("stop", stop)):
         if value is not None and not abs(value) < LATEST / 1e6:
             raise SettingsError(f"{name} is {value} s, but must be a time: leave it out for none")

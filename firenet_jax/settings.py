@@ -1,12 +1,19 @@
 """Words and numbers of a command line -> what they mean, or a SettingsError."""
 
 import math
+from typing import overload
 
 from firenet_jax.errors import SettingsError
 
 LONGEST_SIDE = 2**15  # pixels of a sensor's side at most: coordinates are int16
 
 
+@overload
+def parse_size(text: str) -> tuple[int, int]: ...
+@overload
+def parse_size(text: None) -> None: ...
+@overload
+def parse_size(text: str | None) -> tuple[int, int] | None: ...
 def parse_size(text: str | None) -> tuple[int, int] | None:
     """ "240x180" -> (height, width) = (180, 240); None stays None. Raises SettingsError."""
     if text is None:

@@ -176,7 +176,7 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
 
     Every event votes in the two bins around its time. Events outside the sensor vote nowhere;
     events of one single time all vote in bin 0; a window without events gives zeros.
-    Raises ValueError where the tensors would have 2^31 numbers or more.
+    Raises SettingsError where the tensors would have 2^31 numbers or more.
     """
     steps, batch = packed.t_min.shape
     windows, plane = steps * batch, height * width

@@ -91,7 +91,7 @@ class Shown(NamedTuple):
 
 def run(settings: Demo) -> dict[str, float]:
     """Does what the settings say; returns the numbers it prints. Raises CheckpointError,
-    OutputError or ValueError with a message of one sentence."""
+    OutputError or SettingsError with a message of one sentence."""
     weights = load_weights(settings.weights)
     output = followed(settings.output)
     check_output(output, settings.overwrite)
@@ -117,7 +117,7 @@ def run(settings: Demo) -> dict[str, float]:
     finally:
         shown.close()
     values = (errors / (count - warm_up)).tolist()
-    result = dict(zip(("mse", "ssim", "temporal_error"), values, strict=True))
+    result: dict[str, float] = dict(zip(("mse", "ssim", "temporal_error"), values, strict=True))
     if count == 1:  # a first picture has no predecessor
         del result["temporal_error"]
     temporal = f", temporal error {result['temporal_error']:.4f}" if count > 1 else ""

@@ -171,7 +171,7 @@ class Evaluate:
 
 def run(settings: Evaluate) -> dict:
     """Does what the settings say; returns what results.json holds. Raises RecordingError,
-    CheckpointError, OutputError or ValueError with a message of one sentence."""
+    CheckpointError, OutputError or SettingsError with a message of one sentence."""
     sequences = find_sequences(settings.data)
     methods = load(
         settings.method_names,
@@ -229,7 +229,7 @@ def compute(
 ) -> None:
     """What is neither done nor a gap is computed, written, and added to one of them."""
     work = [key for key in records if key not in done and key not in gaps]
-    by_name = {method.name: method for method in methods}
+    by_name = {method.name: method for method in methods if isinstance(method, Method)}
     total = sum(plans[name].last for name, _ in work)
     with bar(total, "frames", smoothing=0.1) as progress:
         for name, method in work:
@@ -335,7 +335,7 @@ def interval(path: Path, settings: Evaluate) -> tuple[float, float]:
 def first_event(recording: Recording, times: np.ndarray) -> int:
     """Its time. Raises Gap where the events do not reach from before the last frame to after the
     first."""
-    first = last = None
+    first, last = None, 0
     for events in recording.events():
         first = int(events.t[0]) if first is None else first
         last = int(events.t[-1])
@@ -353,7 +353,7 @@ def first_event(recording: Recording, times: np.ndarray) -> int:
 
 def windows_of(plan: Plan, settings: Evaluate) -> Iterator[Window]:
     recording = plan.recording
-    frames = Frames(plan.times, recording.frames.read)
+    frames = Frames(plan.times, plan.frames.read)
     later = (e.select(slice(np.searchsorted(e.t, plan.begin), None)) for e in recording.events())
     recording = dataclasses.replace(recording, frames=frames)
     return cut(recording, settings.windows, filter(len, later), plan.begin)
@@ -362,7 +362,7 @@ def windows_of(plan: Plan, settings: Evaluate) -> Iterator[Window]:
 def displacement(plan: Plan, place: int) -> np.ndarray | None:
     """(H, W, 2) pixels since the frame before, where the recording has flow and the frame before
     is used too."""
-    flow, number = plan.recording.frames.flow, int(plan.numbers[place])
+    flow, number = plan.frames.flow, int(plan.numbers[place])
     if flow is None or place == 0 or number != plan.numbers[place - 1] + 1:
         return None
     velocity = flow(number)
@@ -405,7 +405,7 @@ def evaluate(
     try:
         for place, image in matched(predictions(), plan.times, tolerance):
             if plan.first <= place < plan.last:
-                truth = plan.recording.frames.read(int(plan.numbers[place]))
+                truth = plan.frames.read(int(plan.numbers[place]))
                 if truth.shape != image.shape:
                     raise Gap(f"frame {plan.numbers[place] + 1} is of another size: {truth.shape}")
                 waiting.append(Comparison(place, image, truth, displacement(plan, place)))
@@ -568,7 +568,7 @@ def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
 
     def truth(number: int) -> np.ndarray:
         if number not in truths:
-            frame = plan.recording.frames.read(number).astype(np.float32) / 255
+            frame = plan.frames.read(number).astype(np.float32) / 255
             truths[number] = to_8_bit(equalise(frame, settings.equalise))
         return truths[number]
 
@@ -580,7 +580,7 @@ def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
             images = [f[kind][p] for f, p in zip(kept.values(), places, strict=True)]
             yield number, [events[number], truth(number), *images]
 
-    times = plan.recording.frames.times
+    times = plan.frames.times
     stills = [
         (f"{(int(times[number]) - plan.origin) / 1e6:.3f} s", images)
         for number, images in side_by_side("stills")

@@ -355,10 +355,10 @@ def _gathered(chunks: Iterable[Events]) -> Iterator[Events]:
 
 def run(settings: Simulate) -> list[Path]:
     """Does what the settings say; returns the files, those of an earlier run included. Raises
-    OutputError or ValueError with a message of one sentence."""
+    a FirenetError with a message of one sentence."""
     process, processes = share(settings.process, settings.processes)
     if settings.video is not None:  # which is not dealt out
-        return [] if process else [simulate_clip(settings)]
+        return [] if process else [simulate_clip(settings, settings.video)]
     height, width = parse_size(settings.sensor_size or "240x180")
     folder = settings.output
     if folder.is_file() or folder.suffix in CLIP_SUFFIXES:
@@ -560,9 +560,9 @@ def _check_room(folder: Path, needed: float) -> None:
 # ---- Video files
 
 
-def simulate_clip(settings: Simulate) -> Path:
+def simulate_clip(settings: Simulate, clip: Path) -> Path:
     """A video file -> events and its pictures, as one file; returns its name."""
-    path, clip = settings.output, settings.video
+    path = settings.output
     if path.suffix not in CLIP_SUFFIXES:
         raise OutputError(f"{path}: with --video the output is one file: name it {path}.h5")
     if path.is_dir() or (path.exists() and not settings.overwrite):
@@ -604,7 +604,7 @@ def simulate_clip(settings: Simulate) -> Path:
 def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Picture]:
     """A video file -> its pictures in grey, times from the first; scaled to (height, width).
 
-    Raises ValueError for what cannot be read, or whose times stand still or leave gaps.
+    Raises PictureError for what cannot be read, or whose times stand still or leave gaps.
     """
     first = last = None
     check_readable(path)

@@ -6,7 +6,7 @@ An image (H, W) float32 counts for the frame that is closest to it in time. Both
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from firenet_jax.evaluation import lpips, metrics
 from firenet_jax.evaluation.equalise import Kind, equalise
 from firenet_jax.evaluation.results import METRICS, Measured
-from firenet_jax.events import Recording
+from firenet_jax.events import Frames, Recording
 
 BATCH = 8  # images that are compared at once
 STILLS = (0.2, 0.55, 0.9)  # places of the pictures that are kept, in the part that counts
@@ -38,6 +38,11 @@ class Plan(NamedTuple):
     last: int
     origin: int  # microseconds: the sequence's beginning
     begin: int  # microseconds: reconstruction begins here
+
+    @property
+    def frames(self) -> Frames:
+        """The recording's, which has some: else there is no plan."""
+        return cast(Frames, self.recording.frames)
 
 
 class Comparison(NamedTuple):
@@ -75,7 +80,8 @@ class Measurements:
     """The numbers of one method's images of one sequence, batch by batch."""
 
     def __init__(self, plan: Plan, kind: Kind, learned: lpips.Lpips | None):
-        self.plan, self.kind = plan, kind
+        self.plan = plan
+        self.kind: Kind = kind
         small = min(plan.recording.height, plan.recording.width) < lpips.SMALLEST
         self.learned = None if small else learned
         self.no_lpips = "no weights" if learned is None else "pictures too small"
@@ -118,7 +124,7 @@ class Measurements:
         flows = np.stack([e.flow if k else still for e, k in zip(batch, known, strict=True)])
         previous = np.concatenate([last[1][None], images[:-1]])
         previous_truths = np.concatenate([last[2][None], truths[:-1]])
-        visible = np.isfinite(flows).all(-1)  # files say nan where they know no flow
+        visible = np.asarray(np.isfinite(flows).all(-1))  # files say nan where they know no flow
         errors = metrics.temporal_error(
             *map(_whole, (images, previous, flows, truths, previous_truths, visible))
         ).tolist()

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from firenet_jax.errors import SettingsError
 from firenet_jax.storage.pytorch_file import identify, read_state_dict, take
 
 SMALLEST = 31  # pixels of a side: AlexNet's last pool then makes one of them
@@ -50,7 +51,7 @@ def lpips(weights: Lpips, images: jax.Array, truths: jax.Array) -> jax.Array:
         raise ValueError(f"images {images.shape} cannot be compared with truths {truths.shape}")
     if min(images.shape[-2:]) < SMALLEST:
         size = f"{SMALLEST}x{SMALLEST}"
-        raise ValueError(f"LPIPS needs {size} pixels at least, not {images.shape[-2:]}")
+        raise SettingsError(f"LPIPS needs {size} pixels at least, not {images.shape[-2:]}")
     distance = 0.0
     both = _features(weights, jnp.stack([images, truths]))
     for linear, features in zip(weights.linear, both, strict=True):

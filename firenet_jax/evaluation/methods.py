@@ -68,8 +68,8 @@ def load(
     weights: files of FireNet or FireNet+, each a method named by its stem; without any, those of
     the package. e2vid_random: where no file is named, random weights: for measuring time.
     e2vid_sigmoid: False for E2VID+. A method without weights is `Missing`.
-    Raises ValueError for unknown and repeated names and for weights of methods that are not named,
-    CheckpointError for files that cannot be read.
+    Raises SettingsError for unknown and repeated names and for weights of methods that are not
+    named, CheckpointError for files that cannot be read.
     """
     for name, given in (("firenet", weights), ("e2vid", e2vid_weights)):
         if given and name not in names:

@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from firenet_jax.errors import SettingsError
 from firenet_jax.warp import warp
 
 
@@ -39,7 +40,7 @@ def _matrix(size: int, weights, border: str = "valid", stride: int = 1) -> np.nd
         padded = np.pad(padded, ((taps // 2, (taps - 1) // 2), (0, 0)), border)
     outputs = len(padded) - taps + 1
     if outputs < 1:
-        raise ValueError(f"a side of {size} pixels is too small for a filter of {taps}")
+        raise SettingsError(f"a side of {size} pixels is too small for a filter of {taps}")
     matrix = sum(weight * padded[k : k + outputs] for k, weight in enumerate(weights))
     return matrix[::stride].astype(np.float32)
 
@@ -191,7 +192,9 @@ def ms_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     image, truth = _compared(image, truth)
     scales = ms_ssim_scales(*image.shape[-2:])
     if scales == 0:
-        raise ValueError(f"MS-SSIM needs {WINDOW}x{WINDOW} pixels at least, not {image.shape[-2:]}")
+        raise SettingsError(
+            f"MS-SSIM needs {WINDOW}x{WINDOW} pixels at least, not {image.shape[-2:]}"
+        )
     weights = np.array(SCALES[:scales]) / sum(SCALES[:scales])
     product = jnp.ones(image.shape[:-2])
     for scale, weight in enumerate(weights.tolist()):
@@ -552,12 +555,13 @@ def event_correlation(image: jax.Array, votes: jax.Array) -> jax.Array:
     make it smaller; contrast does not change it, nor does a negative. Two numbers are fitted to a
     block, so an image that has nothing to do with the events has more than 0: compare with what
     the same votes give when they are turned by 180 degrees. What is beyond the last whole block
-    does not count. 0 where there are no events. Raises ValueError for images smaller than a block.
+    does not count. 0 where there are no events.
+    Raises SettingsError for images smaller than a block.
     """
     image, votes = _compared(image, votes)
     rows, columns = (side // BLOCK for side in image.shape[-2:])
     if not rows * columns:
-        raise ValueError(f"{BLOCK}x{BLOCK} pixels at least are needed, not {image.shape[-2:]}")
+        raise SettingsError(f"{BLOCK}x{BLOCK} pixels at least are needed, not {image.shape[-2:]}")
     blur = _gaussian(0.7, radius=3)
     image, votes = (_filter(picture, blur, blur, "symmetric") for picture in (image, votes))
     difference = (-0.5, 0.0, 0.5)

@@ -17,6 +17,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -67,15 +68,18 @@ def read(path: Path) -> Source:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[h5py.File]:
-    """Whatever goes wrong with the file raises RecordingError: damaged bytes, and groups or text
-    where numbers are expected, raise every kind."""
+def opened(path: Path) -> Iterator[Any]:
+    """The file, as h5py opens it: to a type checker any, for a name may hold anything.
+
+    Whatever goes wrong with the file raises RecordingError: damaged bytes, and groups or text where
+    numbers are expected, raise every kind.
+    """
     check_readable(path, RecordingError)
     with reading(path, Exception), h5py.File(path, "r") as file:
         yield file
 
 
-def _layout(path: Path, file: h5py.File) -> str:
+def _layout(path: Path, file: Any) -> str:
     events = file.get("events")
     if isinstance(events, h5py.Group):
         for layout, names in COLUMNS.items():
@@ -97,7 +101,7 @@ def _layout(path: Path, file: h5py.File) -> str:
     )
 
 
-def _reader(path: Path, file: h5py.File, layout: str) -> tuple[Callable[[slice], Events], int]:
+def _reader(path: Path, file: Any, layout: str) -> tuple[Callable[[slice], Events], int]:
     """(rows -> Events, number of rows)"""
     if layout in ("MVSEC", "v2e"):
         events = file[f"{MVSEC}/events" if layout == "MVSEC" else "events"]
@@ -145,7 +149,7 @@ def _reader(path: Path, file: h5py.File, layout: str) -> tuple[Callable[[slice],
     return read, len(columns[0])
 
 
-def _check_stored(path: Path, data: h5py.Dataset):
+def _check_stored(path: Path, data: Any):
     """Data of other files is not read: a stranger would choose which. Compression that h5py lacks
     comes with hdf5plugin, which adds it when imported."""
     if data.external:
@@ -161,7 +165,7 @@ def _events(path: Path, layout: str) -> Iterator[Events]:
         yield from in_chunks(*_reader(path, file, layout))
 
 
-def _frames(path: Path, file: h5py.File, layout: str) -> Frames | None:
+def _frames(path: Path, file: Any, layout: str) -> Frames | None:
     if layout == "MVSEC":
         if f"{MVSEC}/image_raw" not in file:
             return None

@@ -74,7 +74,7 @@ class SceneSettings:
     """How probable it is that a scene lies partly in deep shadow, 10 to 100 times darker."""
 
     def __post_init__(self):
-        """Raises ValueError for numbers that no scene has."""
+        """Raises SettingsError for numbers that no scene has."""
         for name in ("speed", "zoom", "blur", "size", "softness", "gamma"):
             check_range(name, getattr(self, name))
         for name in ("pause", "halt", "still", "plain", "hdr"):

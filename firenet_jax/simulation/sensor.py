@@ -93,7 +93,7 @@ class SensorSettings:
     first rendering, instead of on it."""
 
     def __post_init__(self):
-        """Raises ValueError for numbers that no sensor has."""
+        """Raises SettingsError for numbers that no sensor has."""
         for name in ("threshold_range", "refractory_range"):
             if getattr(self, name) is not None:
                 check_range(name, getattr(self, name))
@@ -365,7 +365,7 @@ def event_list(sensor: Sensor, renderings: Iterable[tuple[int, np.ndarray]]) -> 
     """(microseconds, image (H, W)) in time order -> chunks of time-sorted events, one per interval.
 
     The first rendering gives no events. How dense renderings must be is said by
-    `scenes.rendering_times`. Raises ValueError where time does not advance, or by more than two
+    `scenes.rendering_times`. Raises SettingsError where time does not advance, or by more than two
     seconds.
     """
     state = previous = None
@@ -376,7 +376,7 @@ def event_list(sensor: Sensor, renderings: Iterable[tuple[int, np.ndarray]]) -> 
             continue
         duration = time - previous
         if not 0 < duration <= LONGEST:
-            raise ValueError(
+            raise SettingsError(
                 f"renderings at {previous} and {time} us: each must come after the last, by at "
                 f"most {LONGEST} us"
             )
@@ -514,7 +514,7 @@ def _votes(planes: jax.Array, low, runs, passed: jax.Array, total: jax.Array) ->
 
 
 def check_rare(slow: float, swift: float) -> None:
-    """Raises ValueError where these are no parts of the sequences, or leave none for `motion`."""
+    """Raises SettingsError where these are no parts of the sequences, or leave `motion` none."""
     if not (slow >= 0 and swift >= 0 and slow + swift < 1):
         raise SettingsError(
             f"slow is {slow} and swift is {swift}, but they are parts of the sequences: 0 or more, "
@@ -561,8 +561,8 @@ def random_setups(
     pixels' thresholds differ `UNEVEN` times as much, and most have a fiftieth of noise and leaks),
     and in which much does before a blank ground
     (`SWIFT` pixels, from one rendering to the next by more than one).
-    Raises ValueError where `motion` is more than a pixel from one rendering to the next, the bound
-    of Gehrig et al., "Video to Events", CVPR 2020, or slow and swift leave nothing.
+    Raises SettingsError where `motion` is more than a pixel from one rendering to the next, the
+    bound of Gehrig et al., "Video to Events", CVPR 2020, or slow and swift leave nothing.
     """
     if motion[1] > renderings:
         raise SettingsError(

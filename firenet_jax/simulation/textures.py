@@ -42,7 +42,7 @@ def load_textures(
     are opened. None: the photographs that come with scikit-image.
     procedural: part of the textures that is drawn instead (`PROCEDURAL`); None: none of them
     where pictures are named, else a quarter.
-    Raises ValueError where no picture can be used.
+    Raises PictureError where no picture can be used.
     """
     rng = np.random.default_rng(seed)
     if procedural is None:

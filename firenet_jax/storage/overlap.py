@@ -6,12 +6,12 @@ parser, HDF5, XLA, zlib), so the stages really run side by side.
 
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 
 _END = object()
 
 
-def ahead(items: Iterator, depth: int = 2) -> Iterator:
+def ahead(items: Iterator, depth: int = 2) -> Generator:
     """Yields what `items` yields, computed by a thread at most `depth` items early.
 
     An exception of `items` is raised here, in its place among the items. Closing this iterator

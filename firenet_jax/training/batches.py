@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import grain
 import h5py
@@ -169,7 +169,7 @@ def _index(path: Path) -> Index:
     return Index(names, times, rows)
 
 
-def _stamps(path: Path, column: h5py.Dataset) -> Iterator[Events]:
+def _stamps(path: Path, column: Any) -> Iterator[Events]:
     """Events of which only the time is known."""
     for start in range(0, len(column), CHUNK):
         t = column[start : start + CHUNK]

@@ -55,7 +55,7 @@ def run(settings: Train, stop: int | None = None) -> None:
     """Trains as the settings say, going on where an interrupted run stopped.
 
     stop: leave after so many steps, in the middle of the schedule.
-    Raises ValueError where the settings do not fit the folder, the weights or the devices, or
+    Raises a FirenetError where the settings do not fit the folder, the weights or the devices, or
     where another run writes into the folder.
     """
     join(settings.coordinator, settings.processes, settings.process)

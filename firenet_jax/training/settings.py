@@ -8,7 +8,7 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -150,7 +150,7 @@ class Train:
     def step_settings(self) -> StepSettings:
         """What a step of the training depends on, apart from its data."""
         names = {field.name for field in dataclasses.fields(StepSettings)}
-        chosen = {name: getattr(self, name) for name in names}
+        chosen: dict[str, Any] = {name: getattr(self, name) for name in names}
         return StepSettings(**chosen | {"warmup": warming_up(self)})
 
 

@@ -14,7 +14,7 @@ Read `train_step` first: simulate, scan, differentiate, update.
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -75,7 +75,7 @@ class TrainState(NamedTuple):
 
     params: Any
     optimiser: Any
-    step: jax.Array  # () int32
+    step: jax.Array | np.int32  # () int32
     carried: tuple[SensorState, State] | None  # within a chain
 
 
@@ -125,8 +125,8 @@ def initial_train_state(params: Any, settings: StepSettings, simulates: bool = T
         carried = carried if simulates else (None, carried[1])
         carried = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), carried)
         carried = jax.device_put(carried, sharding(BATCH))
-    state = params, optimiser(settings).init(params), np.int32(0)
-    return TrainState(*replicated(state), carried)
+    begun = TrainState(params, optimiser(settings).init(params), np.int32(0), None)
+    return replicated(begun)._replace(carried=carried)
 
 
 # ---- Simulation
@@ -190,7 +190,7 @@ def _simulated(
     numbers, parts = step // lengths, step % lengths
     sensors, scenes, durations = _setups(key, textures, settings, lengths, numbers)
     bounds = window_bounds(durations, settings.windows, parts * settings.windows)
-    carried = state.carried if chained else None
+    carried = state.carried if state is not None and chained else None
 
     def one_device(sensors, scenes, bounds, carried, parts):
         seen, remembered = _fresh(sensors, scenes, bounds[0], settings)
@@ -276,7 +276,8 @@ def train_step(
         before = initial_state(*size)
         if settings.chain > 1:
             later = state.step % settings.chain > 0
-            before = jax.tree.map(partial(jnp.where, later), state.carried[1], before)
+            carried = cast(tuple, state.carried)[1]
+            before = jax.tree.map(partial(jnp.where, later), carried, before)
             warm = jnp.broadcast_to(later, settings.batch)
     else:
         key, textures = source
