@@ -18,6 +18,7 @@ PACKAGE = Path(fj.__file__).parent
 LAYERS = [
     ["native"],
     ["events", "colour", "convolution", "pictures", "warp", "devices"],
+    ["blocks"],
     ["storage", "windows", "network"],
     ["readers", "tensors", "checkpoint", "filters"],
     ["reconstruction", "simulation"],

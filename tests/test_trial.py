@@ -92,7 +92,7 @@ def random_layer(rng, height, width, batch, inputs=16):
     return maps, kernel, normal(32), [normal(batch, height, width, 16) for _ in range(2)]
 
 
-SEEDS = [*range(3), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(3, 40))]
+SEEDS = [*range(2), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 40))]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -139,10 +139,22 @@ def test_eight_threads_at_once():
         list(pool.map(run, range(160)))
 
 
-def test_mapped_differentiated_and_computed_again():
+def random_cases():
+    """One, and three as one array each."""
     rng = np.random.default_rng(1)
     cases = [random_case(rng, 6, 7, 2) for _ in range(3)]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases)
+    return cases[0], jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases)
+
+
+def test_mapped():
+    _, stacked = random_cases()
+    both_ways(lambda ours: jax.vmap(steps(ours)))(*stacked)
+    both_ways(lambda ours: lambda *cases: jax.lax.map(lambda x: steps(ours)(*x), cases))(*stacked)
+
+
+@pytest.mark.slow
+def test_differentiated_and_computed_again():
+    case, stacked = random_cases()
 
     def gradient(machine_code):
         def loss(weights, state, tensors, valid):
@@ -151,12 +163,7 @@ def test_mapped_differentiated_and_computed_again():
 
         return jax.grad(loss, (0, 1, 2))
 
-    both_ways(lambda ours: jax.vmap(steps(ours)))(*stacked)
-    both_ways(lambda ours: jax.vmap(steps(ours), (None, 0, 0, None)))(
-        cases[0][0], *stacked[1:3], cases[0][3]
-    )
-    both_ways(lambda ours: lambda *case: jax.lax.map(lambda x: steps(ours)(*x), case))(*stacked)
-    both_ways(gradient)(*cases[0])
+    both_ways(gradient)(*case)
     both_ways(lambda ours: jax.vmap(gradient(ours)))(*stacked)
 
 
