@@ -88,18 +88,19 @@ CONVOLVED = "convolved"
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def _layer(machine_code: bool, activations, maps, kernel, bias):
-    def by_xla(maps, kernel, bias):
-        sums = _convolved_by_xla(maps, kernel, 1)[0] + bias.reshape(1, 1, 1, -1)
-        parts = jnp.split(sums, len(activations), -1)
-        return tuple(ACTIVATIONS[name][0](x) for name, x in zip(activations, parts, strict=True))
-
     def by_machine_code(maps, kernel, bias):
         return tuple(native.convolve(maps, kernel, bias, activations))
 
-    return _choose(machine_code, by_machine_code, by_xla, maps, kernel, bias)
+    return choose(machine_code, by_machine_code, partial(by_xla, activations), maps, kernel, bias)
 
 
-def _convolved_by_xla(maps, kernel, results: int):
+def by_xla(activations, maps, kernel, bias):
+    sums = convolved_by_xla(maps, kernel, 1)[0] + bias.reshape(1, 1, 1, -1)
+    parts = jnp.split(sums, len(activations), -1)
+    return tuple(ACTIVATIONS[name][0](x) for name, x in zip(activations, parts, strict=True))
+
+
+def convolved_by_xla(maps, kernel, results: int):
     return tuple(jnp.split(_convolve(_joined(maps), kernel), results, -1))
 
 
@@ -107,11 +108,17 @@ def _joined(maps):
     return maps[0] if len(maps) == 1 else jnp.concatenate(maps, -1)
 
 
-def _choose(machine_code: bool, *functions_and_arguments):
+def choose(machine_code: bool, *functions_and_arguments):
+    """As `native.choose`, but the second function where machine code is not wanted."""
     if machine_code:
         return native.choose(*functions_and_arguments)
-    _, by_xla, *arguments = functions_and_arguments
-    return by_xla(*arguments)
+    _, otherwise, *arguments = functions_and_arguments
+    return otherwise(*arguments)
+
+
+def turned(kernel: jax.Array) -> jax.Array:
+    """The kernel that takes gradients of results to gradients of maps."""
+    return kernel[::-1, ::-1].swapaxes(2, 3)
 
 
 def _forward(machine_code, activations, maps, kernel, bias):
@@ -130,27 +137,29 @@ def _backward(machine_code, activations, kept, gradients):
     def images_by_machine_code(gradients, flipped):
         return tuple(native.convolve(gradients, flipped, None, ("none",) * len(maps)))
 
-    def kernels_by_xla(maps, kernel, gradients):
+    by_maps = choose(
+        machine_code,
+        images_by_machine_code,
+        partial(convolved_by_xla, results=len(maps)),
+        *(gradients, turned(kernel)),
+    )
+    return by_maps, *parameter_gradients(machine_code, maps, kernel, gradients)
+
+
+def parameter_gradients(machine_code: bool, maps, kernel, gradients) -> tuple[jax.Array, jax.Array]:
+    """Those of kernel and bias, from those of a layer's sums."""
+
+    def by_xla(maps, kernel, gradients):
         by = partial(jax.lax.platform_dependent, cpu=kernel_gradient, default=_xla_kernel_gradient)
         joined = _joined(gradients)
         # Summed in float32, whatever the gradients' type.
         by_bias = jnp.sum(joined, (0, 1, 2), dtype=jnp.float32).astype(kernel.dtype)
         return by(_joined(maps), kernel, joined), by_bias
 
-    flipped = kernel[::-1, ::-1].swapaxes(2, 3)
-    by_maps = _choose(
-        machine_code,
-        images_by_machine_code,
-        partial(_convolved_by_xla, results=len(maps)),
-        *(gradients, flipped),
-    )
-    by_kernel_and_bias = _choose(
-        machine_code,
-        lambda *these: native.gradients(*these),
-        kernels_by_xla,
-        *(maps, kernel, gradients),
-    )
-    return by_maps, *by_kernel_and_bias
+    def by_machine_code(*these):
+        return native.gradients(*these)
+
+    return choose(machine_code, by_machine_code, by_xla, maps, kernel, gradients)
 
 
 _layer.defvjp(_forward, _backward)

@@ -14,6 +14,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from firenet_jax import blocks
 from firenet_jax.convolution import layer
 from firenet_jax.events import BINS
 
@@ -55,12 +56,16 @@ class Conv(nn.Module):
     kernel_init: Any = nn.initializers.he_normal()
 
     @nn.compact
-    def __call__(self, *maps: jax.Array) -> tuple[jax.Array, ...]:
-        inputs = sum(x.shape[-1] for x in maps)
+    def parameters(self, inputs: int) -> tuple[jax.Array, jax.Array]:
+        """Kernel and bias."""
         outputs = self.features * len(self.activations)
         kernel = self.param("kernel", self.kernel_init, (3, 3, inputs, outputs))
         bias = self.param("bias", nn.initializers.zeros_init(), (outputs,))
-        maps, kernel, bias = jax.tree.map(lambda x: x.astype(self.dtype), (maps, kernel, bias))
+        return kernel.astype(self.dtype), bias.astype(self.dtype)
+
+    def __call__(self, *maps: jax.Array) -> tuple[jax.Array, ...]:
+        kernel, bias = self.parameters(sum(x.shape[-1] for x in maps))
+        maps = [x.astype(self.dtype) for x in maps]
         return layer(maps, kernel, bias, self.activations)
 
 
@@ -82,6 +87,9 @@ class ConvGRU(nn.Module):
         self.candidate = Conv(self.features, candidate, self.dtype, init)
 
     def __call__(self, h: jax.Array, x: jax.Array, exists: jax.Array | None = None) -> jax.Array:
+        if exists is None and self.dtype == jnp.float32:
+            convs = self.gates, self.candidate
+            return blocks.gru(h, x, *(conv.parameters(2 * self.features) for conv in convs))
         r, z = self.gates(x, h)
         if exists is not None:  # costs nothing here; a choice between h' and h would
             z = z * exists[:, None, None, None]
@@ -100,6 +108,9 @@ class ResidualBlock(nn.Module):
         self.conv2 = Conv(self.features, ("none",), self.dtype)
 
     def __call__(self, x: jax.Array) -> jax.Array:
+        if self.dtype == jnp.float32:
+            convs = self.conv1, self.conv2
+            return blocks.residual(x, *(conv.parameters(self.features) for conv in convs))
         (between,) = self.conv1(x)
         (change,) = self.conv2(between)
         return nn.relu(x + change)

@@ -89,9 +89,10 @@ def _by_xla(recurrent: bool, dtype, weights: Weights, state: State, tensors, val
 def _by_machine_code(recurrent: bool, weights: Weights, state: State, tensors, valid):
     packed, normalised = native.pack(weights.params), replace(weights, normalise=False)
     native_step = partial(native.step, packed, normalise=weights.normalise)
-    enclosed = native.enclose(state)
-    enclosed, images = _scan(native_step, recurrent, normalised, enclosed, tensors, valid)
-    return State(*native.interior(enclosed, *tensors.shape[2:4])), images
+    if len(tensors) == 1:  # not in place: the caller's state stays
+        native_step = partial(native_step, in_place=False)
+    state, images = _scan(native_step, recurrent, normalised, tuple(state), tensors, valid)
+    return State(*state), images
 
 
 def _scan(step, recurrent: bool, weights: Weights, state, tensors, valid):
@@ -254,24 +255,23 @@ def events_to_pictures(
     valid: (T, B) bool, as in `reconstruct`.
     mesh: devices that share the B recordings equally, for events from `pack_for_devices`.
     """
+    # Numbers are normalised before they are padded or dealt out to colours.
+    early = weights.normalise and (network.pad > 1 or network.color)
+    dtype = jnp.bfloat16 if network.bfloat16 else jnp.float32
+    run = partial(reconstruct, recurrent=network.recurrent, dtype=dtype)
 
-    # Numbers are normalised before they are padded or dealt out to colours; an accelerator does it
-    # for all windows at once, a CPU as part of each step.
-    all_at_once = jax.default_backend() != "cpu"
-    early = weights.normalise and (all_at_once or network.pad > 1 or network.color)
+    def all_at_once(weights, state, inputs, valid):
+        return run(replace(weights, normalise=False), state, normalise(inputs), valid)
 
     def shown(weights, session, inputs, valid):
         height, width = inputs.shape[2:4]
         (top, bottom), (left, right) = sides = padding(height, width, network.pad)
         inputs = jnp.pad(inputs, ((0, 0), (0, 0), *sides, (0, 0)), mode="reflect")
-        state, images = reconstruct(
-            replace(weights, normalise=weights.normalise and not early),
-            session.network,
-            inputs,
-            valid,
-            recurrent=network.recurrent,
-            dtype=jnp.bfloat16 if network.bfloat16 else jnp.float32,
-        )
+        arguments = weights, session.network, inputs, valid
+        if early or not weights.normalise:
+            state, images = run(replace(weights, normalise=False), *arguments[1:])
+        else:  # an accelerator normalises all windows at once, a CPU as part of each step
+            state, images = jax.lax.platform_dependent(*arguments, cpu=run, default=all_at_once)
         # The original program crops last: its mask and its range see the padded image.
         ranges, greys = display(session.display, images, valid, settings)
         greys = greys[:, :, top : top + height, left : left + width]

@@ -64,3 +64,19 @@ def reference() -> Path:
 def recordings() -> Path:
     """Folder with real recordings, one for each format."""
     return _folder("FIRENET_RECORDINGS")
+
+
+@pytest.fixture(scope="module", params=["machine code", "XLA"])
+def each_way(request):
+    """All tests of a module as they are on this processor, and then all by XLA alone.
+
+    For a whole module at a time: what is compiled knows of no switch and must be forgotten.
+    """
+    if request.param == "machine code":
+        yield
+        return
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FIRENET_NATIVE", "0")
+        jax.clear_caches()
+        yield
+    jax.clear_caches()

@@ -197,12 +197,12 @@ def test_nothing_is_read_or_written_beside_the_arrays(shape):
         lambda module: [_convolution(module, layer)], [image, kernel, np.zeros_like(gradient)]
     )
     assert_same(found.reshape(result.shape), result)
-    *_, found = run(
+    *_, found, _ = run(
         lambda module: [
             _sums(module, height, width, (inputs,), (outputs,)),
             _total(module, batch, height, 2, kernel.size + outputs),
         ],
-        [image, gradient, np.zeros(batch * parts * numbers), np.zeros(numbers)],
+        [image, gradient, np.zeros(numbers), np.zeros(batch * parts * numbers)],
     )
     assert_same(found[: kernel.size].reshape(kernel.shape), by_kernel)
     assert_same(found[kernel.size :], gradient.astype(np.float64).sum((0, 1, 2)))

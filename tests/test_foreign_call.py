@@ -1,6 +1,7 @@
 import re
 import shutil
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
@@ -20,39 +21,55 @@ pytestmark = pytest.mark.skipif(
 def test_every_part_runs_once_and_stages_wait_for_each_other():
     """Stage 0 adds 1 to each part's number, stage 1 adds its neighbour's to it (of 0: of the last).
 
-    What stage 1 reads must be finished whoever wrote it, and no part may run twice.
+    What stage 1 reads must be finished whoever wrote it, and no part may run twice; the memory in
+    between belongs to one call alone, whatever sizes others ask for.
     """
-    parts, images, runs = 37, 3, 300
+    parts, scratch, runs = 37, 320, 300
     module = Module()
 
     def stage(name, write):
         f = Function(module, name, [POINTER, INT, INT])
         pointers, image, part = f.arguments
-        numbers, first, second = (f.load(POINTER, pointers, 8 * i) for i in range(3))
+        numbers, result, between = (f.load(POINTER, pointers, 8 * i) for i in range(3))
         here = f.times(f.b.add(f.times(image, parts), part), 8)
+
+        def of_image(part):
+            return f.at(between, f.times(image, scratch), f.times(part, 8))
+
         left = f.b.srem(f.b.add(part, integer(parts - 1)), integer(parts))
-        there = f.times(f.b.add(f.times(image, parts), left), 8)
-        write(f, numbers, first, second, here, there)
+        write(f, numbers, result, here, of_image(part), of_image(left))
         f.b.ret_void()
         return f.function
 
-    def one(f, numbers, first, second, here, there):
-        f.store(integer(0), second, here)
-        f.store(f.b.add(f.load(INT, numbers, here), integer(1)), first, here)
+    def one(f, numbers, result, here, at, left):
+        f.store(integer(0), result, here)
+        f.store(f.b.add(f.load(INT, numbers, here), integer(1)), at)
 
-    def two(f, numbers, first, second, here, there):
-        value = f.b.add(f.load(INT, first, here), f.load(INT, first, there))
-        f.store(f.b.add(f.load(INT, second, here), value), second, here)
+    def two(f, numbers, result, here, at, left):
+        value = f.b.add(f.load(INT, at), f.load(INT, left))
+        f.store(f.b.add(f.load(INT, result, here), value), result, here)
 
     stages = [stage("one", one), stage("two", two)]
-    register("firenet_test_parts", module, stages, parts, arguments=1, results=[0, 1])
+    register("firenet_test_parts", module, stages, parts, 1, 1, scratch)
     with jax.enable_x64(True):
-        shape = jax.ShapeDtypeStruct((images, parts), jnp.int64)
-        call = jax.jit(jax.ffi.ffi_call("firenet_test_parts", [shape, shape]))
-        numbers = np.random.default_rng(0).integers(0, 1000, (images, parts))
-        expected = numbers + 1 + np.roll(numbers + 1, 1, axis=1)
-        for _ in range(runs):
-            np.testing.assert_array_equal(call(numbers)[1], expected)
+
+        @jax.jit
+        def call(numbers):
+            shape = jax.ShapeDtypeStruct(numbers.shape, jnp.int64)
+            return jax.ffi.ffi_call("firenet_test_parts", shape)(numbers)
+
+        rng = np.random.default_rng(0)
+        cases = [jnp.asarray(rng.integers(0, 1000, (images, parts))) for images in (3, 1, 7)]
+        compiled = {numbers.shape: call.lower(numbers).compile() for numbers in cases}
+
+        def run(i):
+            numbers = cases[i % len(cases)]
+            return numbers, np.asarray(compiled[numbers.shape](numbers))
+
+        with ThreadPoolExecutor(8) as pool:
+            for numbers, found in pool.map(run, range(runs)):
+                expected = numbers + 1 + np.roll(numbers + 1, 1, axis=1)
+                np.testing.assert_array_equal(found, expected)
 
 
 # Each number of the source and what the header says it is.
@@ -71,12 +88,15 @@ OF_THE_HEADER = {
     " + offsetof(XLA_FFI_Api_Version, minor_version)",
     "BUFFER_DATA": "offsetof(XLA_FFI_Buffer, data)",
     "BUFFER_DIMENSIONS": "offsetof(XLA_FFI_Buffer, dims)",
+    "API_CREATE_ERROR": "offsetof(XLA_FFI_Api, XLA_FFI_Error_Create)",
+    "RESOURCE_EXHAUSTED": "XLA_FFI_Error_Code_RESOURCE_EXHAUSTED",
     "API_DESTROY_ERROR": "offsetof(XLA_FFI_Api, XLA_FFI_Error_Destroy)",
     "API_SCHEDULE": "offsetof(XLA_FFI_Api, XLA_FFI_ThreadPool_Schedule)",
     "API_THREADS": "offsetof(XLA_FFI_Api, XLA_FFI_ThreadPool_NumThreads)",
 }
 # Structures that `handler` makes itself: 16 bytes of head, then these, 8 bytes each.
 MADE = {
+    "XLA_FFI_Error_Create_Args": ["message", "errc"],
     "XLA_FFI_Error_Destroy_Args": ["error"],
     "XLA_FFI_ThreadPool_Schedule_Args": ["ctx", "task", "data"],
     "XLA_FFI_ThreadPool_NumThreads_Args": ["ctx", "num_threads"],

@@ -27,6 +27,7 @@ from firenet_jax.storage.video import FolderWriter
 from firenet_jax.windows import Windows
 
 HEIGHT, WIDTH = 20, 24
+EACH_WAY = pytest.mark.usefixtures("each_way")
 
 
 def write_recording(path, count=3000, seed=0, width=WIDTH, height=HEIGHT):
@@ -73,6 +74,7 @@ def test_a_recording_becomes_a_folder_of_pictures(tmp_path, weights, capsys):
 
 
 @pytest.mark.parametrize("batch", [1, 2, 3])
+@EACH_WAY
 def test_a_batch_gives_what_each_recording_gives_alone(tmp_path, weights, batch):
     """Five recordings of different lengths and two sizes; slots are used again."""
     lengths = (700, 2050, 400, 1200, 900)
@@ -149,6 +151,7 @@ def unfinished(weights, recording, output, monkeypatch):
 
 
 @pytest.mark.parametrize("at, color", [(2, False), (9, False), (9, True), (30, False)])
+@EACH_WAY
 def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, weights, monkeypatch, at, color):
     recording = write_recording(tmp_path / "a.txt", 3050)
     choices = {"display": Display(auto_range=True), "network": Network(color=color)}
@@ -288,6 +291,7 @@ def test_a_damaged_recording_does_not_keep_others_from_being_done(
     assert {path.name for path in (tmp_path / "all").iterdir()} == set(names)
 
 
+@EACH_WAY
 def test_an_interrupted_run_of_several_goes_on(tmp_path, weights, monkeypatch, caplog):
     paths = tuple(write_recording(tmp_path / f"{name}.txt", 1500, seed=3) for name in "abc")
     run(settings(weights, paths[:1], tmp_path / "alone"))
@@ -467,6 +471,7 @@ print(json.dumps(counts))
 """
 
 
+@EACH_WAY
 def test_nothing_recompiles_while_200_windows_of_200_sizes_stream(tmp_path, weights):
     """In a fresh process; a grid of 5 ms windows that hold 1, 4, 9, ... 40,000 events."""
     sizes = np.arange(1, 201) * np.arange(1, 201)
@@ -533,6 +538,7 @@ def test_what_a_run_keeps_for_another_is_true_and_does_not_stay(tmp_path, weight
     assert names == {"timestamps.txt", *(f"frame_{n:010d}.png" for n in range(10))}
 
 
+@EACH_WAY
 def test_colours_of_a_recording_that_ends_beside_one_that_goes_on(tmp_path, weights):
     """Windows that do not exist are those of its own channels."""
     paths = [write_recording(tmp_path / f"r{n}.txt", n, seed=n) for n in (800, 600)]

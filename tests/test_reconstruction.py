@@ -1,3 +1,5 @@
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +20,8 @@ from firenet_jax.reconstruction import (
 )
 from firenet_jax.tensors import normalise as normalised
 from firenet_jax.tensors import pack, voxelise
+
+pytestmark = pytest.mark.usefixtures("each_way")
 
 
 @pytest.mark.parametrize("chunk", [1, 3, 7])
@@ -151,6 +155,23 @@ def test_events_become_pictures_without_a_word_from_the_host():
     assert " while(" in program  # the scan; so the names below would be found too
     for talk in ("infeed", "outfeed", " send(", " recv(", "copy-start", "callback"):
         assert talk not in program
+
+
+def test_accelerators_normalise_all_windows_at_once_and_cpus_one_by_one():
+    """What a program is for decides, not what this machine has."""
+    weights = Weights(initial_params(jax.random.key(0)), True)
+    packed = pack([[random_events(np.random.default_rng(t), 50, 8, 9)] for t in range(3)])
+    arguments = weights, initial_session(1, 8, 9, Network()), packed, np.ones((3, 1), bool)
+    traced = events_to_pictures.trace(*arguments, height=8, width=9)
+
+    def roots(platform):
+        """How many axes what a root is taken of has: (T, B, 1, 1, 1) or (B, 1, 1, 1)."""
+        text = traced.lower(lowering_platforms=(platform,)).as_text()
+        found = re.findall(r"stablehlo.r?sqrt .*tensor<((?:\d+x)+)f32>", text)
+        return {sizes.count("x") for sizes in found}
+
+    assert 5 in roots("cuda") and 4 not in roots("cuda")
+    assert 5 not in roots("cpu")
 
 
 def test_the_pictures_network_runs_as_it_is_told():

@@ -19,6 +19,7 @@ LAYERS = [
     ["native", "errors"],
     ["settings"],
     ["events", "colour", "convolution", "pictures", "warp", "devices"],
+    ["blocks"],
     ["storage", "windows", "network"],
     ["readers", "tensors", "checkpoint", "filters"],
     ["reconstruction", "simulation"],

@@ -1,6 +1,6 @@
 """Arrays -> arrays: what is quicker as machine code of our own than as XLA's, on a CPU.
 
-    step                        one window of the network, of packed parameters, enclosed states
+    step                        one window of the network, of packed parameters
     convolve, gradients         a 3x3 layer of training; gradients of its kernel and bias
     choose                      these or what XLA computes, as platform, export and switch have it
     by_xla_alone, is_wanted     the switch for a part of a program
@@ -15,8 +15,6 @@ from firenet_jax.native.choice import Unavailable, by_xla_alone, choose, is_want
 
 _HOME = {
     "convolve": "convolve3x3",
-    "enclose": "whole_step",
-    "interior": "whole_step",
     "gradients": "convolve3x3",
     "pack": "whole_step",
     "step": "whole_step",

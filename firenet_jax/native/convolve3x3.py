@@ -9,7 +9,7 @@ register, added to sums that stay in registers: as many as a processor has, for 
 multiply-add long before the last one has ended.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -50,11 +50,6 @@ def _pointers(f: Function, pointers, count: int) -> list:
     return [f.load(POINTER, pointers, 8 * i) for i in range(count)]
 
 
-def _between(f: Function, value, least: int, most: int):
-    value = f.b.select(f.less(value, least), integer(least), value)
-    return f.min(value, most)
-
-
 # --- The convolution ---------------------------------------------------------------------------
 
 ACTIVATIONS = {
@@ -62,6 +57,61 @@ ACTIVATIONS = {
     "relu": Function.relu,
     "sigmoid": Function.sigmoid,
     "tanh": Function.tanh,
+}
+
+
+class Ending(NamedTuple):
+    """What becomes of the sums of a pixel and of the same pixel of other maps, 16 channels each."""
+
+    operands: int
+    results: int
+    write: Callable  # (function, sums, operands) -> results
+
+
+def _gates(f: Function, sums, operands):
+    """Reset, update, and what the first leaves of the state."""
+    reset, update = map(f.sigmoid, sums)
+    return [reset, update, f.b.fmul(reset, operands[0])]
+
+
+def _candidate(f: Function, sums, operands):
+    (before, update), candidate = operands, f.tanh(sums[0])
+    return [candidate, f.fma(update, f.b.fsub(candidate, before), before)]
+
+
+def _residual(f: Function, sums, operands):
+    return [f.relu(f.b.fadd(sums[0], operands[0]))]
+
+
+def _positive(f: Function, sums, operands):
+    return [f.b.select(f.is_positive(operands[0]), sums[0], vector(0))]
+
+
+def _add(f: Function, sums, operands):
+    return [f.b.fadd(a, b) for a, b in zip(sums, operands, strict=True)]
+
+
+def _candidate_gradient(f: Function, sums, operands):
+    """See `blocks.gru`."""
+    (by_input, by_left), (before, reset, update, candidate, by_state) = sums, operands
+
+    def slope(y):
+        return f.b.fmul(y, f.b.fsub(vector(1), y))
+
+    change = f.b.fmul(by_state, f.b.fsub(candidate, before))
+    stays = f.fma(by_left, reset, f.b.fmul(by_state, f.b.fsub(vector(1), update)))
+    by_reset = f.b.fmul(f.b.fmul(by_left, before), slope(reset))
+    return [by_input, by_reset, f.b.fmul(change, slope(update)), stays]
+
+
+ENDINGS = {
+    "gates": Ending(1, 3, _gates),
+    "candidate": Ending(2, 2, _candidate),
+    "residual": Ending(1, 1, _residual),
+    "positive": Ending(1, 1, _positive),
+    "add": Ending(1, 1, _add),
+    "add both": Ending(2, 2, _add),
+    "candidate gradient": Ending(5, 4, _candidate_gradient),
 }
 
 
@@ -74,6 +124,7 @@ class Layer(NamedTuple):
     activations: tuple[str, ...]  # of each result
     outputs: int  # of each result
     has_bias: bool
+    ending: str = ""  # after the activations, with results of its own
 
     @property
     def all_inputs(self) -> int:
@@ -82,6 +133,14 @@ class Layer(NamedTuple):
     @property
     def all_outputs(self) -> int:
         return len(self.activations) * self.outputs
+
+    @property
+    def operands(self) -> int:
+        return ENDINGS[self.ending].operands if self.ending else 0
+
+    @property
+    def results(self) -> int:
+        return ENDINGS[self.ending].results if self.ending else len(self.activations)
 
     @property
     def together(self) -> int:
@@ -95,17 +154,13 @@ class Layer(NamedTuple):
         most = max(1, min(self.width, room // self.together))
         return min(range(1, most + 1), key=lambda n: (-(-self.width // n) * (n + 1), -n))
 
-    def enclosed_line(self, inputs: int) -> int:
-        """Bytes of a row of a block and its neighbours."""
-        return 4 * (self.pixels + 2) * inputs
-
 
 def _block(module: Module, layer: Layer, activations: tuple[str, ...]) -> Code:
     """block(record): pixels side by side, one vector of outputs or two of these activations.
 
     The record is of pointers: for each map the upper left neighbour of the block and, as a number,
-    the bytes of a row of it; the kernel's first column of outputs, the bias's; for each vector of
-    outputs where its pixels go.
+    the bytes of a row of it; the kernel's first column of outputs, the bias's; of each operand, and
+    for each vector of outputs or each result of the ending, where its pixels are.
     """
     name = "_".join(("block", *activations))
     f = Function(module, name, [POINTER])
@@ -113,9 +168,9 @@ def _block(module: Module, layer: Layer, activations: tuple[str, ...]) -> Code:
     (record,) = f.arguments
     together, across = len(activations), 4 * layer.all_outputs
     fields = 2 * len(layer.inputs)
-    kernel, bias, *targets = (
-        f.load(POINTER, record, 8 * (fields + i)) for i in range(2 + together)
-    )
+    pixels = layer.operands + (layer.results if layer.ending else together)
+    kernel, bias, *pixels = (f.load(POINTER, record, 8 * (fields + i)) for i in range(2 + pixels))
+    operands, targets = pixels[: layer.operands], pixels[layer.operands :]
     sums, before = [vector(0)] * (layer.pixels * together), 0
     if layer.has_bias:
         sums = [f.load_unaligned(VECTOR, bias, v * VECTOR_BYTES) for v in range(together)]
@@ -148,10 +203,14 @@ def _block(module: Module, layer: Layer, activations: tuple[str, ...]) -> Code:
 
         sums = f.loop(0, 9, tap, sums)
         before += inputs
-    for i, value in enumerate(sums):
-        n, v = divmod(i, together)
-        value = ACTIVATIONS[activations[v]](f, value)
-        f.store_unaligned(value, targets[v], 4 * n * layer.outputs)
+    for n in range(layer.pixels):
+        place, values = 4 * n * layer.outputs, sums[n * together : (n + 1) * together]
+        values = [ACTIVATIONS[a](f, value) for a, value in zip(activations, values, strict=True)]
+        if layer.ending:
+            others = [f.load_unaligned(VECTOR, operand, place) for operand in operands]
+            values = ENDINGS[layer.ending].write(f, values, others)
+        for value, target in zip(values, targets, strict=True):
+            f.store_unaligned(value, target, place)
     f.b.ret_void()
     return f.function
 
@@ -162,19 +221,19 @@ def _convolution(module: Module, layer: Layer) -> Code:
     pointers, image, part = f.arguments
     height, width, pixels = layer.height, layer.width, layer.pixels
     maps, results = len(layer.inputs), len(layer.activations)
-    arrays = _pointers(f, pointers, maps + 1 + layer.has_bias + results)
-    lines = [4 * inputs * width for inputs in layer.inputs]
+    others = layer.operands + layer.results
+    arrays = _pointers(f, pointers, maps + 1 + layer.has_bias + others)
     sources = [
-        f.at(array, f.times(image, height * line))
-        for array, line in zip(arrays[:maps], lines, strict=True)
+        f.at(array, f.times(image, 4 * height * width * inputs))
+        for array, inputs in zip(arrays[:maps], layer.inputs, strict=True)
     ]
     kernel, bias = arrays[maps], arrays[maps + layer.has_bias]
-    targets = [
+    pixels_of = [
         f.at(array, f.times(image, 4 * height * width * layer.outputs))
-        for array in arrays[-results:]
+        for array in arrays[-others:]
     ]
-    enclosed = [f.alloca(3 * layer.enclosed_line(inputs)) for inputs in layer.inputs]
-    record = f.alloca(8 * (2 * maps + 2 + layer.together))
+    enclosed = [f.alloca(3 * 4 * (pixels + 2) * inputs) for inputs in layer.inputs]
+    record = f.alloca(8 * (2 * maps + 2 + max(others, layer.together)))
     # Which result, and how many bytes into its pixels, for each vector of outputs.
     lanes = [
         (result, lane * VECTOR_BYTES)
@@ -188,47 +247,25 @@ def _convolution(module: Module, layer: Layer) -> Code:
         if key not in code:
             code[key] = _block(module, layer, key)
 
-    def enclose(source, target, inputs, y, left):
-        pixel, line, whole = 4 * inputs, 4 * inputs * width, layer.enclosed_line(inputs)
-        f.memset(target, 3 * whole)
-        start = _between(f, f.b.sub(left, integer(1)), 0, width)
-        stop = _between(f, f.b.add(left, integer(pixels + 1)), 0, width)
-        skipped = f.b.add(f.b.sub(start, left), integer(1))
-
-        def row(i, _):
-            here = f.b.add(y, f.b.sub(i, integer(1)))
-            inside = f.b.and_(f.less(-1, here), f.less(here, height))
-            with f.b.if_then(inside):
-                f.memcpy(
-                    f.at(target, f.times(i, whole), f.times(skipped, pixel)),
-                    f.at(source, f.times(here, line), f.times(start, pixel)),
-                    f.times(f.b.sub(stop, start), pixel),
-                )
-
-        f.loop(0, 3, row)
-
     def of_row(y, _):
-        is_inside = f.b.and_(f.less(0, y), f.less(y, height - 1))
-
         def of_block(i, _):
             # The last block begins early enough to end with the row.
             left = f.min(f.times(i, pixels), width - pixels)
-            inside = f.b.and_(f.less(0, left), f.less(left, width - pixels))
-            inside = f.b.and_(inside, is_inside)
-            with f.b.if_then(f.b.not_(inside)):
-                for source, target, inputs in zip(sources, enclosed, layer.inputs, strict=True):
-                    enclose(source, target, inputs, y, left)
+            corner, area = (f.b.sub(y, integer(1)), f.b.sub(left, integer(1))), (height, width)
             for i, inputs in enumerate(layer.inputs):
-                corner = f.at(sources[i], f.times(y, lines[i]), f.times(left, 4 * inputs))
-                corner = f.at(corner, -lines[i] - 4 * inputs)
-                line = f.b.select(inside, integer(lines[i]), integer(layer.enclosed_line(inputs)))
-                f.store(f.b.select(inside, corner, enclosed[i]), record, 16 * i)
+                begin, line = f.patch(
+                    sources[i], area, 4 * inputs, corner, (3, pixels + 2), enclosed[i]
+                )
+                f.store(begin, record, 16 * i)
                 f.store(line, record, 16 * i + 8)
             there = f.times(f.b.add(f.times(y, width), left), 4 * layer.outputs)
             for i, group in enumerate(groups):
                 first = i * layer.together * VECTOR_BYTES
                 fields = [f.at(kernel, first), f.at(bias, first)]
-                fields += [f.at(targets[result], there, lane) for result, lane in group]
+                if layer.ending:
+                    fields += [f.at(array, there) for array in pixels_of]
+                else:
+                    fields += [f.at(pixels_of[result], there, lane) for result, lane in group]
                 for k, field in enumerate(fields):
                     f.store(field, record, 8 * (2 * maps + k))
                 key = tuple(layer.activations[result] for result, _ in group)
@@ -247,11 +284,10 @@ def _make_convolution(*layer) -> str:
     stage = _convolution(module, layer)
     inputs = "_".join(map(str, layer.inputs))
     results = "_".join(layer.activations) + f"_{layer.outputs}" + "_bias" * layer.has_bias
+    results += "_".join(["", *layer.ending.split()])
     name = f"firenet_convolution_{layer.height}_{layer.width}_{inputs}_{results}"
-    arguments = len(layer.inputs) + 1 + layer.has_bias
-    register(
-        name, module, [stage], _parts(layer.height), arguments, list(range(len(layer.activations)))
-    )
+    arguments = len(layer.inputs) + 1 + layer.has_bias + layer.operands
+    register(name, module, [stage], _parts(layer.height), arguments, layer.results)
     return name
 
 
@@ -311,8 +347,8 @@ def _sums(module: Module, height: int, width: int, maps: tuple, gradients: tuple
     """Of some rows of an image: its own sums, all of the kernel's gradient and the bias's."""
     f = Function(module, "sums", [POINTER, INT, INT])
     pointers, image, part = f.arguments
-    arrays = _pointers(f, pointers, len(maps) + len(gradients) + 1)
-    arrays, partial = arrays[:-1], arrays[-1]
+    arrays = _pointers(f, pointers, len(maps) + len(gradients) + 2)
+    arrays, partial = arrays[:-2], arrays[-1]
     arrays = [
         f.at(array, f.times(image, 4 * height * width * channels))
         for array, channels in zip(arrays, maps + gradients, strict=True)
@@ -382,11 +418,11 @@ def _sums(module: Module, height: int, width: int, maps: tuple, gradients: tuple
 def _total(module: Module, batch: int, height: int, arrays: int, numbers: int) -> Code:
     """Some of these gradients, of so many numbers: the sums of all parts of all images.
 
-    arrays: how many come before these sums.
+    arrays: how many come before the result.
     """
     f = Function(module, "total", [POINTER, INT, INT])
     pointers, image, part = f.arguments
-    partial, result = _pointers(f, pointers, arrays + 2)[arrays:]
+    result, partial = _pointers(f, pointers, arrays + 2)[arrays:]
     count, whole = batch * _parts(height), numbers // LANES
     each = -(-whole // count)
     index = f.b.add(f.times(image, _parts(height)), part)
@@ -410,14 +446,15 @@ def _total(module: Module, batch: int, height: int, arrays: int, numbers: int) -
 
 def _make_gradient(batch: int, height: int, width: int, maps: tuple, gradients: tuple) -> str:
     module = Module()
-    arrays = len(maps) + len(gradients)
+    arrays, numbers = len(maps) + len(gradients), (9 * sum(maps) + 1) * sum(gradients)
     stages = [
         _sums(module, height, width, maps, gradients),
-        _total(module, batch, height, arrays, (9 * sum(maps) + 1) * sum(gradients)),
+        _total(module, batch, height, arrays, numbers),
     ]
     sizes = "_".join(map(str, (batch, height, width, *maps, "by", *gradients)))
     name = f"firenet_kernel_gradient_{sizes}"
-    register(name, module, stages, _parts(height), arrays, [0, 1])
+    parts = _parts(height)
+    register(name, module, stages, parts, arrays, results=1, scratch=4 * parts * numbers)
     return name
 
 
@@ -429,24 +466,28 @@ def convolve(
     kernel: jax.Array,
     bias: jax.Array | None = None,
     activations: tuple[str, ...] = ("none",),
+    ending: str = "",
+    operands: Sequence[jax.Array] = (),
 ) -> list[jax.Array]:
     """Maps (B, H, W, .), seen as one of I channels, (3, 3, I, O), (O,) -> as many maps as names.
 
     activations: none, relu, sigmoid, tanh: one for each of the equal parts of the outputs.
+    ending: one of `ENDINGS`, of one or two parts of 16 outputs and of operands (B, H, W, 16): then
+    the results are its own.
     Raises Unavailable for what it does not compute, where XLA must.
     """
-    _check(kernel, *maps, *(() if bias is None else (bias,)))
+    _check(kernel, *maps, *operands, *(() if bias is None else (bias,)))
     batch, height, width, _ = maps[0].shape
     outputs, odd = divmod(kernel.shape[3], len(activations))
-    if odd or outputs % LANES:
+    if odd or outputs % LANES or (ending and (outputs != LANES or len(activations) > 2)):
         raise Unavailable
     inputs = tuple(x.shape[3] for x in maps)
-    layer = Layer(height, width, inputs, activations, outputs, bias is not None)
+    layer = Layer(height, width, inputs, activations, outputs, bias is not None, ending)
     shape = jax.ShapeDtypeStruct((batch, height, width, outputs), jnp.float32)
     call = jax.ffi.ffi_call(
-        made(_make_convolution, *layer), [shape] * len(activations), vmap_method="sequential"
+        made(_make_convolution, *layer), [shape] * layer.results, vmap_method="sequential"
     )
-    return list(call(*maps, kernel, *(() if bias is None else (bias,))))
+    return list(call(*maps, kernel, *(() if bias is None else (bias,)), *operands))
 
 
 def gradients(
@@ -459,13 +500,12 @@ def gradients(
     if any(outputs % LANES for outputs in channels[1]):
         raise Unavailable
     numbers = kernel.size + kernel.shape[3]
-    shapes = (batch * _parts(height), numbers), (numbers,)
     call = jax.ffi.ffi_call(
         made(_make_gradient, batch, height, width, *channels),
-        [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes],
+        jax.ShapeDtypeStruct((numbers,), jnp.float32),
         vmap_method="sequential",
     )
-    both = call(*maps, *changes)[1]
+    both = call(*maps, *changes)
     return both[: kernel.size].reshape(kernel.shape), both[kernel.size :]
 
 

@@ -31,11 +31,17 @@ FRAME_EXTENSION, FRAME_API, FRAME_CONTEXT, FRAME_ARGUMENTS, FRAME_RESULTS = 8, 1
 EXTENSION_TYPE, EXTENSION_METADATA, IS_METADATA = 8, 24, 1
 METADATA_MAJOR, METADATA_MINOR = 24, 28
 BUFFER_DATA, BUFFER_DIMENSIONS = 24, 40
-API_DESTROY_ERROR, API_SCHEDULE, API_THREADS = 64, 136, 144
+API_CREATE_ERROR, API_DESTROY_ERROR, API_SCHEDULE, API_THREADS = 48, 64, 136, 144
+RESOURCE_EXHAUSTED = 8
 
 # A call's record on the heap: how many may still use it, images, who has come, arrays; and for each
 # stage, in cache lines of their own, how many parts are done, and taken of each half.
 USERS, IMAGES, WORKERS, ARRAYS, COUNTERS, COUNTER = 0, 8, 16, 24, 128, 64
+
+# Memory that the stages of a call share is kept for the next call, of whatever function: to have
+# new pages from the system takes as long as a good part of the work. One block, its size before it.
+LINE, MOST_KEPT = 64, 2**28
+_kept = ctypes.c_int64(0)
 
 
 def register(
@@ -44,17 +50,19 @@ def register(
     stages: list[Code],
     parts: int,
     arguments: int,
-    results: list[int],
+    results: int,
+    scratch: int = 0,
 ) -> None:
     """Compiles the module and makes it known to XLA under this name.
 
     stages: functions of the module, (pointer to pointers, int64 image, int64 part).
     parts: of each stage, for each image of the batch: the first axis of argument 0.
-    arguments, results: how many arguments, and which results, the stages get pointers of.
+    arguments, results: how many; the stages get pointers of them, and then, if there is some, of
+    scratch: bytes of memory for each image, a multiple of 64, that all stages of a call share.
     Raises RuntimeError where XLA's interface has another version than this was written for.
     """
     work = _work(module, stages, parts)
-    _handler(module, work, len(stages), parts, arguments, results)
+    _handler(module, work, len(stages), parts, arguments, results, scratch)
     handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(compiled(module)("handler"))
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
 
@@ -150,7 +158,44 @@ def _leave(f: Function, record) -> None:
         f.b.call(f.external("free", VOID, POINTER), [record])
 
 
-def _handler(module, work, stages: int, parts: int, arguments: int, results: list[int]) -> None:
+def _take(f: Function, size):
+    """Where so many bytes, a multiple of a line, may be used; null if there are none."""
+    kept = f.b.inttoptr(integer(ctypes.addressof(_kept)), POINTER)
+    found = f.alloca(LINE)
+    f.store(f.b.atomic_rmw("xchg", kept, integer(0), "acquire"), found)
+
+    def block():
+        return f.load(POINTER, found)
+
+    def is_there():
+        return f.b.icmp_unsigned("!=", block(), NULL)
+
+    with f.b.if_then(is_there()), f.b.if_then(f.less(f.load(INT, block()), size)):
+        f.b.call(f.external("free", VOID, POINTER), [block()])
+        f.store(NULL, found)
+    with f.b.if_then(f.b.not_(is_there())):
+        allocate = f.external("aligned_alloc", POINTER, INT, INT)
+        f.store(f.b.call(allocate, [integer(LINE), f.b.add(size, integer(LINE))]), found)
+        with f.b.if_then(is_there()):
+            f.store(size, block())
+    return f.b.select(is_there(), f.at(block(), LINE), NULL)
+
+
+def _give_back(f: Function, memory) -> None:
+    """Keeps it for the next call, in place of what was kept before."""
+    kept = f.b.inttoptr(integer(ctypes.addressof(_kept)), POINTER)
+    block, free = f.at(memory, -LINE), f.external("free", VOID, POINTER)
+    with f.b.if_else(f.less(MOST_KEPT, f.load(INT, block))) as (too_large, otherwise):
+        with too_large:
+            f.b.call(free, [block])
+        with otherwise:
+            before = f.b.atomic_rmw("xchg", kept, f.b.ptrtoint(block, INT), "acq_rel")
+            f.b.call(free, [f.b.inttoptr(before, POINTER)])  # of null: nothing
+
+
+def _handler(
+    module, work, stages: int, parts: int, arguments: int, results: int, scratch: int
+) -> None:
     """handler(frame): what XLA calls: asks XLA's threads for help, works itself, leaves."""
     f = Function(module, "helper", [POINTER])
     (record,) = f.arguments
@@ -181,8 +226,15 @@ def _handler(module, work, stages: int, parts: int, arguments: int, results: lis
     inputs = f.load(POINTER, frame, FRAME_ARGUMENTS)
     outputs = f.load(POINTER, frame, FRAME_RESULTS)
     buffers = [f.load(POINTER, inputs, 8 * i) for i in range(arguments)]
-    buffers += [f.load(POINTER, outputs, 8 * i) for i in results]
+    buffers += [f.load(POINTER, outputs, 8 * i) for i in range(results)]
     images = f.load(INT, f.load(POINTER, buffers[0], BUFFER_DIMENSIONS))
+
+    if scratch:
+        memory = _take(f, f.times(images, scratch))
+        with f.b.if_then(f.b.icmp_unsigned("==", memory, NULL)):
+            text = f.text("no memory for the maps of a step")
+            error = structure(text, integer(RESOURCE_EXHAUSTED))
+            f.b.ret(f.call_pointer(f.load(POINTER, api, API_CREATE_ERROR), error))
 
     number = f.alloca(8)
     f.store(integer(1), number)
@@ -196,6 +248,8 @@ def _handler(module, work, stages: int, parts: int, arguments: int, results: lis
     f.store(images, record, IMAGES)
     for i, buffer in enumerate(buffers):
         f.store(f.load(POINTER, buffer, BUFFER_DATA), record, ARRAYS + 8 * i)
+    if scratch:
+        f.store(memory, record, ARRAYS + 8 * len(buffers))
 
     def hire(i, _):
         hired = succeeds(API_SCHEDULE, f.b.ptrtoint(helper, INT), record)
@@ -205,6 +259,8 @@ def _handler(module, work, stages: int, parts: int, arguments: int, results: lis
     with f.b.if_then(f.less(1, threads)):
         f.loop(1, threads, hire)
     f.b.call(work, [record])
+    if scratch:  # nobody works any more, though some may still look for work
+        _give_back(f, memory)
     _leave(f, record)
     f.b.ret(NULL)
 

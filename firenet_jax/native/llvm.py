@@ -113,6 +113,46 @@ class Function:
             memory.align = VECTOR_BYTES
             return self.b.inttoptr(self.b.ptrtoint(memory, INT), POINTER)
 
+    def patch(self, image, area, pixel: int, corner, patch, memory):
+        """Rows of a patch of an image -> where they begin, and the bytes from one to the next.
+
+        Where the patch goes beyond the image, it is copied, with zeros around, to this memory.
+        area, patch: rows and columns; the patch begins at corner, values, at most one before the
+        image. pixel: bytes.
+        """
+        (height, width), (rows, columns), (top, left) = area, patch, corner
+        line, whole = width * pixel, columns * pixel
+        inside = self.b.not_(self.b.or_(self.less(top, 0), self.less(left, 0)))
+        inside = self.b.and_(inside, self.less(top, height - rows + 1))
+        inside = self.b.and_(inside, self.less(left, width - columns + 1))
+
+        def row(i, _):
+            y = self.b.add(top, i)
+            with self.b.if_then(self.b.and_(self.less(-1, y), self.less(y, height))):
+                first = self.b.select(self.less(left, 0), integer(0), left)
+                last = self.min(self.b.add(left, integer(columns)), width)
+                target = self.at(memory, self.times(i, whole))
+                target = self.at(target, self.times(self.b.sub(first, left), pixel))
+                source = self.at(image, self.times(y, line), self.times(first, pixel))
+                self.memcpy(target, source, self.times(self.b.sub(last, first), pixel))
+
+        with self.b.if_then(self.b.not_(inside)):
+            self.memset(memory, rows * whole)
+            self.loop(0, rows, row)
+        here = self.at(image, self.times(top, line), self.times(left, pixel))
+        begin = self.b.select(inside, here, memory)
+        return begin, self.b.select(inside, integer(line), integer(whole))
+
+    def text(self, characters: str):
+        """The address of a text, which stands as long as the module."""
+        value = bytearray(characters.encode() + b"\0")
+        constant = ir.Constant(ir.ArrayType(INT8, len(value)), value)
+        name = self.module.get_unique_name("text")
+        variable = ir.GlobalVariable(self.module, constant.type, name)
+        variable.linkage, variable.global_constant = "internal", True
+        variable.initializer = constant
+        return self.b.ptrtoint(variable, INT)
+
     # Whole numbers
 
     def times(self, number, factor: int):
@@ -176,6 +216,9 @@ class Function:
 
     def is_not_zero(self, x):
         return self.b.fcmp_unordered("!=", x, vector(0))
+
+    def is_positive(self, x):
+        return self.b.fcmp_ordered(">", x, vector(0))
 
     def relu(self, x):
         return self.max(x, vector(0))

@@ -10,9 +10,9 @@ Networks", CVPR 2016, Eqs. 5 to 8): 24 products instead of 72 for 4 rows of 2 pi
 
     Y = A^T [sum over inputs of (G g G^T) * (B^T d B)] A
 
-with * element by element, d a patch of 6x4 pixels of an input and g its kernel. A map is
-(H + 2, W + 2) pixels of 16 channels, H and W rounded up to whole tiles, zero wherever there is no
-pixel of the image.
+with * element by element, d a patch of 6x4 pixels of an input and g its kernel. States are (H, W)
+pixels of 16 channels, as everywhere. A map within the step is (H + 2, W + 2) of them, H and W
+rounded up to whole tiles, zero wherever there is no pixel of the image.
 """
 
 from collections.abc import Callable
@@ -94,6 +94,9 @@ PLACES = 2 * COLUMNS.patch  # of two rows
 # --- The network -------------------------------------------------------------------------------
 
 
+BEFORE = {"g1": "g1 before", "g2": "g2 before"}  # states
+
+
 class Layer(NamedTuple):
     """What becomes of a convolution's sums."""
 
@@ -113,19 +116,20 @@ def _relu(f, sums, _):
 
 
 def _gru(source: str, state: str) -> list[Stage]:
-    """Both gates; then the candidate, after which the state changes in place."""
+    """Both gates; then the candidate, and the new state, which may take the old one's place."""
+    before = BEFORE[state]
 
     def reset(f, sums, at):
-        return f.b.fmul(f.sigmoid(sums), at(state))
+        return f.b.fmul(f.sigmoid(sums), at(before))
 
     def update(f, sums, at):
         return f.b.fmul(f.sigmoid(sums), f.exists)
 
     def candidate(f, sums, at):
-        return f.fma(at("update"), f.b.fsub(f.tanh(sums), at(state)), at(state))
+        return f.fma(at("update"), f.b.fsub(f.tanh(sums), at(before)), at(before))
 
     return [
-        Stage((source, state), (Layer("reset", reset), Layer("update", update))),
+        Stage((source, before), (Layer("reset", reset), Layer("update", update))),
         Stage((source, "reset"), (Layer(state, candidate),)),
     ]
 
@@ -226,6 +230,15 @@ class Size(NamedTuple):
         return (ROWS.tile * self.down + 2) * self.line
 
     @property
+    def state(self) -> int:
+        return self.height * self.width * PIXEL
+
+    @property
+    def patch(self) -> tuple[int, int]:
+        """Rows and columns of pixels that a block is made of."""
+        return ROWS.patch, COLUMNS.tile * self.block + 2
+
+    @property
     def moments(self) -> int:
         """Bytes of what is known of the numbers of each four rows of an event tensor."""
         return -(-len(MOMENTS) * 4 * self.down // PIXEL) * PIXEL
@@ -270,13 +283,17 @@ def _linear(f: Function, matrix: np.ndarray, values: list) -> list:
 
 
 def _transform(module: Module, size: Size, rows: slice) -> Code:
-    """transform(upper left neighbour of a block, transformed): B^T d B, (places, tiles)."""
-    f = Function(module, f"transform{rows.start}", [POINTER, POINTER])
+    """transform(upper left neighbour of a block, bytes of a row, transformed): B^T d B.
+
+    Transformed are (places, tiles).
+    """
+    f = Function(module, f"transform{rows.start}", [POINTER, INT, POINTER])
     f.function.attributes.add("noinline")
-    corner, transformed = f.arguments
+    corner, line, transformed = f.arguments
+    lines = [f.times(line, y) for y in range(ROWS.patch)]
 
     def column(pixel, x):
-        pixels = [f.load(VECTOR, pixel, y * size.line + x * PIXEL) for y in range(ROWS.patch)]
+        pixels = [f.load(VECTOR, pixel, line, x * PIXEL) for line in lines]
         return _linear(f, ROWS.input[rows], pixels)
 
     def tile(t, left):
@@ -360,8 +377,7 @@ def _arrays(f: Function, size: Size, pointers, image) -> dict:
         "events": 4 * BINS * size.height * size.width,
         "weights": 0,
         "exists": 4,
-        "g1": size.map,
-        "g2": size.map,
+        **dict.fromkeys([*BEFORE.values(), *BEFORE], size.state),
         "image": 4 * size.height * size.width,
         "inner": size.inner,
     }
@@ -512,6 +528,7 @@ def _stage(
     arrays = _arrays(f, size, pointers, image)
     transformed = f.alloca(len(stage.sources) * PLACES * size.place)
     sums = f.alloca(PLACES * size.place)
+    enclosed = f.alloca(size.patch[0] * size.patch[1] * PIXEL)
     pixels = [f.alloca(ROWS.tile * COLUMNS.tile * size.place) for _ in stage.layers]
     f.exists = f.splat(f.load(FLOAT, arrays["exists"]))
     f.prediction = f.load(VECTOR, arrays["weights"], _weights(len(STAGES)))
@@ -529,17 +546,29 @@ def _stage(
             sums_of_row = f.at(pixels, f.times(f.b.sub(y, top), COLUMNS.tile * size.place))
 
             def pixel(x, _):
-                here = f.b.add(line, f.times(x, PIXEL))
+                place = f.b.add(places, x)
+
+                def here(name):
+                    if name in INNER:
+                        return f.at(arrays[name], f.b.add(line, f.times(x, PIXEL)))
+                    return f.at(arrays[name], f.times(place, 4 if name == "image" else PIXEL))
+
                 total = f.b.fadd(f.load(VECTOR, sums_of_row, f.times(x, PIXEL)), bias)
-                value = layer.finish(f, total, lambda name: f.load(VECTOR, arrays[name], here))
-                if layer.target == "image":
-                    f.store(value, arrays["image"], f.times(f.b.add(places, x), 4))
-                else:
-                    f.store(value, arrays[layer.target], here)
+                value = layer.finish(f, total, lambda name: f.load(VECTOR, here(name)))
+                f.store(value, here(layer.target))
 
             f.loop(fresh, right, pixel)
 
         f.loop(top, bottom, row)
+
+    def corner(source, left):
+        """The upper left neighbour of a block in this map, and the bytes of a row of it."""
+        if source in INNER:
+            here = f.b.add(f.times(top, size.line), f.times(left, PIXEL))
+            return f.at(arrays[source], here), integer(size.line)
+        upper_left = f.b.sub(top, integer(1)), f.b.sub(left, integer(1))
+        area = size.height, size.width
+        return f.patch(arrays[source], area, PIXEL, upper_left, size.patch, enclosed)
 
     def block(i, _):
         # The last block begins early enough to end with the row; what the one before it has
@@ -547,13 +576,13 @@ def _stage(
         wanted = f.times(i, size.block)
         first = f.min(wanted, size.across - size.block)
         left, fresh = f.times(first, COLUMNS.tile), f.times(f.b.sub(wanted, first), COLUMNS.tile)
-        corner = f.b.add(f.times(top, size.line), f.times(left, PIXEL))
+        corners = [corner(source, left) for source in stage.sources]
         maps, inputs = len(stage.sources), _inputs(stage)
         starts = [weights + i * _weights_of_layer(stage) for i in range(len(stage.layers))]
         for group, (forth, back) in enumerate(zip(transform, restore, strict=True)):
-            for s, source in enumerate(stage.sources):
+            for s, (corner_of_map, line) in enumerate(corners):
                 there = f.at(transformed, s * PLACES * size.place)
-                f.b.call(forth, [f.at(arrays[source], corner), there])
+                f.b.call(forth, [corner_of_map, line, there])
             for start, of_layer in zip(starts, pixels, strict=True):
                 kernels = f.at(arrays["weights"], start + PIXEL + group * PLACES * inputs * PIXEL)
                 each = integer(inputs // maps)
@@ -580,9 +609,8 @@ def _weights(stage: int) -> int:
     return sum(len(each.layers) * _weights_of_layer(each) for each in STAGES[:stage])
 
 
-def _target(height: int, width: int, normalise: bool) -> str:
-    """Compiles the step for images of this size -> the name by which XLA knows it."""
-    size, module = Size(height, width), Module()
+def _stages(module: Module, size: Size, normalise: bool) -> list[Code]:
+    """All stages of a step, in order."""
     if normalise:
         moments = [{"count": _voted, "sum": _itself}, {"squares": _square}]
         first = [_moments(module, size, terms) for terms in moments]
@@ -593,34 +621,22 @@ def _target(height: int, width: int, normalise: bool) -> str:
         [write(module, size, rows) for rows in GROUPS] for write in (_transform, _restore)
     )
     multiply = _multiply(module, size)
-    stages = [
+    return first + [
         _stage(module, size, f"stage{i}", stage, _weights(i), transform, multiply, restore)
         for i, stage in enumerate(STAGES)
     ]
+
+
+def _make(height: int, width: int, normalise: bool) -> str:
+    """Compiles the step for images of this size -> the name by which XLA knows it."""
+    size, module = Size(height, width), Module()
     name = f"firenet_step_{height}_{width}" + "_normalised" * normalise
-    register(name, module, [*first, *stages], size.down, 5, [2, 3])
+    stages = _stages(module, size, normalise)
+    register(name, module, stages, size.down, arguments=5, results=3, scratch=size.inner)
     return name
 
 
 # --- To JAX ------------------------------------------------------------------------------------
-
-
-def enclose(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-    """States as `step` keeps them: maps, (B, H + 2, W + 2, 16), H and W those of whole tiles."""
-    if 0 in state[0].shape:
-        raise Unavailable
-    batch, height, width, _ = state[0].shape
-    below, right = -height % ROWS.tile, -width % COLUMNS.tile
-    sides = (0, 0), (1, 1 + below), (CHANNELS, (1 + right) * CHANNELS)  # quicker than four axes
-    shape = batch, height + 2 + below, width + 2 + right, CHANNELS
-    g1, g2 = (jnp.pad(h.reshape(batch, height, -1), sides).reshape(shape) for h in state)
-    return g1, g2
-
-
-def interior(state: tuple[jax.Array, jax.Array], height: int, width: int):
-    """The other way: (B, H, W, 16)."""
-    g1, g2 = (h[:, 1 : 1 + height, 1 : 1 + width] for h in state)
-    return g1, g2
 
 
 def step(
@@ -629,25 +645,26 @@ def step(
     tensor: jax.Array,
     exists: jax.Array | None = None,
     normalise: bool = False,
+    in_place: bool = True,
 ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
-    """One window, as `network.step`, of packed parameters and an enclosed state; no gradient.
+    """One window, as `network.step`, of packed parameters; no gradient.
 
     All arrays are float32, of at least one pixel, but exists (B,) bool.
     normalise: the tensor first, as `tensors.normalise` does.
+    in_place: in a scan the new state takes the old one's memory; else it needs none of its own, so
+    that a state that comes from outside is not copied.
     Raises Unavailable where there is no machine code for it.
     """
     batch, height, width, _ = tensor.shape
     exists = jnp.ones(batch) if exists is None else exists
-    if vectors() == 0:
+    if vectors() == 0 or not tensor.size:
         raise Unavailable
-    size = Size(height, width)
-    shapes = [h.shape for h in state]
-    shapes += [(batch, height, width), (batch * size.inner // 4,)]
+    shapes = [h.shape for h in state] + [(batch, height, width)]
     call = jax.ffi.ffi_call(
-        made(_target, height, width, normalise),
+        made(_make, height, width, normalise),
         [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes],
-        input_output_aliases={3: 0, 4: 1},
+        input_output_aliases={3: 0, 4: 1} if in_place else {},
         vmap_method="sequential",
     )
-    g1, g2, image, _ = call(tensor, packed, exists.astype(jnp.float32), *state)
+    g1, g2, image = call(tensor, packed, exists.astype(jnp.float32), *state)
     return (g1, g2), image

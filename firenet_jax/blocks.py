@@ -1,0 +1,195 @@
+"""Maps, kernels, biases -> maps: ConvGRU and residual block, gradients of their own included.
+
+Equal to what their layers (`convolution.layer`) give one by one, and to those layers' gradients.
+As one, what a convolution's sums become on their way into the next one takes no time on a CPU: maps
+that go through memory once more for each sum, product and slope take as long as the convolutions
+themselves. Maps are (B, H, W, 16) float32, parameters (kernel, bias), 3x3.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
+
+from firenet_jax import native
+from firenet_jax.convolution import (
+    CONVOLVED,
+    by_xla,
+    choose,
+    convolved_by_xla,
+    parameter_gradients,
+    turned,
+)
+
+Parameters = tuple[jax.Array, jax.Array]
+
+
+def gru(h: jax.Array, x: jax.Array, gates: Parameters, candidate: Parameters) -> jax.Array:
+    """r, z = sigmoid(gates([x, h])), q = tanh(candidate([x, r h])) -> h' = h + z (q - h).
+
+    Gradients in reverse mode only: what they need of it is kept under the name `CONVOLVED`.
+    """
+    return _gru(native.is_wanted(), h, x, gates, candidate)
+
+
+def residual(x: jax.Array, first: Parameters, second: Parameters) -> jax.Array:
+    """relu(x + second(relu(first(x)))), likewise."""
+    return _residual(native.is_wanted(), x, first, second)
+
+
+def _kept(maps):
+    return tuple(checkpoint_name(each, CONVOLVED) for each in maps)
+
+
+def _slope(y):
+    """Of the sigmoid, where its result is y."""
+    return y * (1 - y)
+
+
+# ---- ConvGRU
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _gru(machine_code, h, x, gates, candidate):
+    return _gru_forward(machine_code, h, x, gates, candidate)[0]
+
+
+def _gru_forward(machine_code, h, x, gates, candidate):
+    def gates_by_machine_code(h, x, kernel, bias):
+        return tuple(native.convolve([x, h], kernel, bias, ("none",) * 2, "gates", [h]))
+
+    def gates_by_xla(h, x, kernel, bias):
+        reset, update = by_xla(("sigmoid", "sigmoid"), (x, h), kernel, bias)
+        return reset, update, reset * h
+
+    def candidate_by_machine_code(h, update, x, left, kernel, bias):
+        return tuple(
+            native.convolve([x, left], kernel, bias, ending="candidate", operands=[h, update])
+        )
+
+    def candidate_by_xla(h, update, x, left, kernel, bias):
+        (q,) = by_xla(("tanh",), (x, left), kernel, bias)
+        return q, h + update * (q - h)
+
+    reset, update, left = _kept(
+        choose(machine_code, gates_by_machine_code, gates_by_xla, h, x, *gates)
+    )
+    q, state = _kept(
+        choose(
+            machine_code,
+            candidate_by_machine_code,
+            candidate_by_xla,
+            *(h, update, x, left, *candidate),
+        )
+    )
+    return state, (h, x, gates[0], candidate[0], reset, update, left, q)
+
+
+def _gru_backward(machine_code, kept, by_state):
+    h, x, gates, candidate, reset, update, left, q = kept
+
+    def through_candidate_by_machine_code(change, kernel, *operands):
+        both = ("none", "none")
+        return tuple(native.convolve([change], kernel, None, both, "candidate gradient", operands))
+
+    def through_candidate_by_xla(change, kernel, h, reset, update, q, by_state):
+        by_x, by_left = convolved_by_xla([change], kernel, 2)
+        return (
+            by_x,
+            by_left * h * _slope(reset),
+            by_state * (q - h) * _slope(update),
+            by_left * reset + by_state * (1 - update),
+        )
+
+    def through_gates_by_machine_code(changes, kernel, *operands):
+        return tuple(native.convolve(changes, kernel, None, ("none",) * 2, "add both", operands))
+
+    def through_gates_by_xla(changes, kernel, by_x, by_h):
+        more_x, more_h = convolved_by_xla(changes, kernel, 2)
+        return by_x + more_x, by_h + more_h
+
+    change = by_state * update * (1 - q * q)
+    by_candidate = parameter_gradients(machine_code, (x, left), candidate, (change,))
+    by_x, by_reset, by_update, by_h = choose(
+        machine_code,
+        through_candidate_by_machine_code,
+        through_candidate_by_xla,
+        *(change, turned(candidate), h, reset, update, q, by_state),
+    )
+    changes = by_reset, by_update
+    by_gates = parameter_gradients(machine_code, (x, h), gates, changes)
+    by_x, by_h = choose(
+        machine_code,
+        through_gates_by_machine_code,
+        through_gates_by_xla,
+        *(changes, turned(gates), by_x, by_h),
+    )
+    return by_h, by_x, by_gates, by_candidate
+
+
+_gru.defvjp(_gru_forward, _gru_backward)
+
+
+# ---- Residual block
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _residual(machine_code, x, first, second):
+    return _residual_forward(machine_code, x, first, second)[0]
+
+
+def _residual_forward(machine_code, x, first, second):
+    def first_by_machine_code(x, kernel, bias):
+        return tuple(native.convolve([x], kernel, bias, ("relu",)))
+
+    def second_by_machine_code(x, between, kernel, bias):
+        return tuple(native.convolve([between], kernel, bias, ending="residual", operands=[x]))
+
+    def second_by_xla(x, between, kernel, bias):
+        return (jax.nn.relu(x + by_xla(("none",), (between,), kernel, bias)[0]),)
+
+    def first_by_xla(x, kernel, bias):
+        return by_xla(("relu",), (x,), kernel, bias)
+
+    (between,) = _kept(choose(machine_code, first_by_machine_code, first_by_xla, x, *first))
+    (result,) = _kept(
+        choose(machine_code, second_by_machine_code, second_by_xla, x, between, *second)
+    )
+    return result, (x, first[0], second[0], between, result)
+
+
+def _residual_backward(machine_code, kept, by_result):
+    x, first, second, between, result = kept
+
+    def through_second_by_machine_code(change, kernel, between):
+        return tuple(native.convolve([change], kernel, ending="positive", operands=[between]))
+
+    def through_second_by_xla(change, kernel, between):
+        return (jnp.where(between > 0, convolved_by_xla([change], kernel, 1)[0], 0),)
+
+    def through_first_by_machine_code(change, kernel, by_result):
+        return tuple(native.convolve([change], kernel, ending="add", operands=[by_result]))
+
+    def through_first_by_xla(change, kernel, by_result):
+        return (convolved_by_xla([change], kernel, 1)[0] + by_result,)
+
+    by_result = jnp.where(result > 0, by_result, 0)
+    by_second = parameter_gradients(machine_code, (between,), second, (by_result,))
+    (change,) = choose(
+        machine_code,
+        through_second_by_machine_code,
+        through_second_by_xla,
+        *(by_result, turned(second), between),
+    )
+    by_first = parameter_gradients(machine_code, (x,), first, (change,))
+    (by_x,) = choose(
+        machine_code,
+        through_first_by_machine_code,
+        through_first_by_xla,
+        *(change, turned(first), by_result),
+    )
+    return by_x, by_first, by_second
+
+
+_residual.defvjp(_residual_forward, _residual_backward)
