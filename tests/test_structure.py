@@ -19,7 +19,7 @@ LAYERS = [
     ["native"],
     ["events", "colour", "convolution", "pictures", "warp", "devices"],
     ["storage", "windows", "network"],
-    ["readers", "tensors", "checkpoint", "filters"],
+    ["readers", "tensors", "checkpoint", "filters", "instants"],
     ["reconstruction", "simulation"],
     ["evaluation"],
     ["training"],
