@@ -30,10 +30,12 @@ LAYERS = [
 DOORS = {
     "flax": {"network", "evaluation.baselines"}, "optax": {"training.run"},
     "orbax": {"training.run"}, "torch": set(), "av": {"storage.video", "commands.simulate"},
-    "h5py": {"readers", "training.batches", "commands.simulate", "commands.evaluate"},
+    "h5py": {
+        "readers", "training.batches", "commands.simulate", "commands.evaluate", "storage.arrays",
+    },
     "pyarrow": {"readers"}, "grain": {"training.batches"}, "faery": {"readers"},
-    "rosbags": {"readers"}, "hdf5plugin": {"readers"}, "skimage": {"evaluation.equalise"},
-    "llvmlite": {"native"},
+    "rosbags": {"readers", "storage.bag"}, "hdf5plugin": {"readers"}, "llvmlite": {"native"},
+    "skimage": {"evaluation.equalise"},
 }  # fmt: skip
 
 

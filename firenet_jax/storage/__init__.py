@@ -4,6 +4,8 @@ Knows nothing of the network and its data. Read `files` first.
 
     files          each file is made beside its name and gets it in the end; locks; settings
     video          pictures -> a folder of png, mp4, gif
+    arrays         images -> one HDF5 file of float32
+    bag            pictures -> ROS 1 and ROS 2 bags
     pytorch_file   PyTorch's files -> numpy arrays, running nothing that they hold
     overlap        an iterator, run ahead in a thread
     progress       bars, and lines where there is no terminal
