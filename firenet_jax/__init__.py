@@ -11,7 +11,8 @@
     for tensors, times in fj.event_tensors(recording, events_per_pixel=0.35):
         state, images = fj.reconstruct(weights, state, tensors)
 
-`fj.recording(t, x, y, p, width=240, height=180)` makes one of arrays.
+`fj.recording(t, x, y, p, width=240, height=180)` makes one of arrays. Images at given times, in
+microseconds, whatever the windows: `for times, images in fj.images_at(weights, recording, times)`.
 
 Names are loaded when they are first used (PEP 562), so importing this package loads no jax.
 No module has the name of a function here: importing the module would hide the function.
@@ -31,6 +32,8 @@ _HOME = {
     "Weights": "network",
     "display": "pictures",
     "event_tensors": "tensors",
+    "grid": "instants",
+    "images_at": "reconstruction",
     "initial_display_state": "pictures",
     "initial_state": "network",
     "load_weights": "checkpoint",

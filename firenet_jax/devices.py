@@ -126,7 +126,3 @@ def on_each_device(function, in_specs, out_specs, mesh: Mesh | None = None):
     return jax.shard_map(
         function, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
     )
-
-
-# What `reconstruct` and `reconstruction` still call them.
-EVERYWHERE, in_a_row, shared = REPLICATED, device_mesh, sharding

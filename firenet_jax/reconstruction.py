@@ -2,19 +2,24 @@
 
 Event tensors are (T, B, H, W, 5), images (T, B, H, W). State goes in and comes out, so a recording
 may be streamed in chunks of any T, and B recordings of different lengths may run side by side:
-`valid` (T, B) says which windows exist, and the others leave the state as it was.
+`valid` (T, B) says which windows exist, and the others leave the state as it was. Images at given
+times are steps whose state is thrown away (instants.py).
 """
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh
 
 from firenet_jax import colour, native
-from firenet_jax.devices import BATCH, EVERYWHERE, TIME_BATCH, on_each_device
+from firenet_jax.devices import BATCH, REPLICATED, TIME_BATCH, on_each_device
+from firenet_jax.events import Events, Recording
+from firenet_jax.instants import Step, steps
 from firenet_jax.network import (
     BINS,
     CHANNELS,
@@ -31,7 +36,16 @@ from firenet_jax.pictures import (
     event_pictures,
     initial_display_state,
 )
-from firenet_jax.tensors import IN_LISTS, Packed, normalise, voxelise
+from firenet_jax.tensors import (
+    IN_LISTS,
+    Packed,
+    capacity,
+    in_groups,
+    normalise,
+    pack,
+    voxelise,
+)
+from firenet_jax.windows import Windows, usual
 
 
 @dataclass(frozen=True)
@@ -193,24 +207,163 @@ def _shapes_of_params() -> dict[str, tuple[int, ...]]:
     return {jax.tree_util.keystr(path): leaf.shape for path, leaf in _leaves(shapes)}
 
 
+# --- Images at given times: steps that are kept, and looks
+
+
+class Committed(NamedTuple):
+    """The two states that were kept last: what images at times in between begin from."""
+
+    before: State
+    last: State
+
+
+class Looks(NamedTuple):
+    """What T steps of B recordings are, as `instants.steps` says."""
+
+    looks: jax.Array  # (T, B) bool: an image whose new state is thrown away; else it is kept
+    share: jax.Array  # (T, B) float32: of a look, how far from `before` to `last` it begins
+
+
+@partial(jax.jit, static_argnames=("recurrent", "dtype", "machine_code"))
+def reconstruct_at(
+    weights: Weights,
+    committed: Committed,
+    tensors: jax.Array,
+    steps: Looks,
+    valid: jax.Array | None = None,
+    *,
+    recurrent: bool = True,
+    dtype=jnp.float32,
+    machine_code: bool = True,
+) -> tuple[Committed, jax.Array]:
+    """(Committed, (T, B, H, W, 5), Looks) -> (Committed, images (T, B, H, W) float32).
+
+    As `reconstruct`, for steps of which some only look. Not to be differentiated.
+    """
+    weights, last, tensors, valid = _checked(weights, committed.last, tensors, valid)
+    _, before, _, _ = _checked(weights, committed.before, tensors, valid)
+    if valid is None:
+        valid = jnp.ones(tensors.shape[:2], bool)
+    inputs = weights, Committed(before, last), tensors, steps, valid
+    xla = partial(_at_by_xla, recurrent, dtype)
+    if dtype == jnp.float32 and machine_code:
+        return native.choose(partial(_at_by_machine_code, recurrent), xla, *inputs)
+    with native.by_xla_alone(not machine_code):
+        return xla(*inputs)
+
+
+def _at_by_xla(recurrent: bool, dtype, weights: Weights, *inputs):
+    return _scan_at(partial(step, weights.params, dtype=dtype), recurrent, weights, *inputs)
+
+
+def _at_by_machine_code(recurrent: bool, weights: Weights, committed: Committed, tensors, *inputs):
+    packed, normalised = native.pack(weights.params), replace(weights, normalise=False)
+    native_step = partial(native.step, packed, normalise=weights.normalise)
+    enclosed = Committed(*(native.enclose(state) for state in committed))
+    enclosed, images = _scan_at(native_step, recurrent, normalised, enclosed, tensors, *inputs)
+    size = tensors.shape[2:4]
+    return Committed(*(State(*native.interior(state, *size)) for state in enclosed)), images
+
+
+def _scan_at(step, recurrent: bool, weights: Weights, committed: Committed, tensors, steps, valid):
+    def chosen(choice, a, b):
+        """Of each recording a where the choice says so, else b."""
+        return jax.tree.map(lambda a, b: jnp.where(choice[:, None, None, None], a, b), a, b)
+
+    def between(share, a, b):
+        share = share[:, None, None, None]
+        return jax.tree.map(lambda a, b: (1 - share) * a + share * b, a, b)
+
+    def body(committed, inputs):
+        tensor, steps, exists = inputs
+        tensor = normalise(tensor) if weights.normalise else tensor
+        # A step that is kept begins from the last state exactly: 0 a + 1 b.
+        share = jnp.where(steps.looks, steps.share, 1.0)
+        new, image = step(between(share, *committed), tensor, exists)
+        if recurrent:
+            kept = exists & ~steps.looks
+            committed = Committed(
+                chosen(kept, committed.last, committed.before), chosen(kept, new, committed.last)
+            )
+        return committed, image
+
+    return jax.lax.scan(body, committed, (tensors, steps, valid))
+
+
+def images_at(
+    weights: Weights,
+    recording: Recording,
+    times: Iterable[int],
+    *,
+    chunk: int = 8,
+    **windows,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Recording, times -> chunks of (times (n,) int64, images (n, H, W) float32), as they come.
+
+    times: microseconds on the recording's clock, in order; also endless ones, such as
+    `instants.grid` gives. Of those before the first event and after the last one there is no image.
+    windows: of the states that are kept, as `windows.Windows` takes them; without any 0.35 events
+    per pixel, at most 40 ms, as in `firenet reconstruct`. An image depends on these and on the
+    events up to its time, not on which other times are asked for.
+    chunk: steps that the device takes at once; nothing is compiled for each length, and memory
+    holds a chunk, whatever the recording's length.
+    Raises ValueError for windows that cannot be, RecordingError where the file is damaged.
+    """
+    if chunk < 1:
+        raise ValueError(f"chunk is {chunk}, but must be 1 or more steps")
+    chosen = Windows(**windows) if windows else usual(recording.events())
+    height, width, size = recording.height, recording.width, 0
+    state = initial_state(1, height, width)
+    committed = Committed(state, state)
+    for group in in_groups(steps(recording, chosen, times), chunk):
+        rows = [[step.events] for step in group] + [[Events.empty()]] * (chunk - len(group))
+        size = capacity(sum(len(row[0]) for row in rows), size)
+        tensors = voxelise(pack(rows, size), height=height, width=width)
+        looks, valid = looks_of([group], chunk), np.arange(chunk)[:, None] < len(group)
+        committed, images = reconstruct_at(weights, committed, tensors, looks, valid)
+        seen = np.flatnonzero(looks.looks[:, 0])
+        if seen.size:
+            found = np.array([group[i].time for i in seen], np.int64)
+            yield found, np.asarray(images)[seen, 0]
+
+
+def looks_of(groups: Sequence[Sequence[Step]], length: int) -> Looks:
+    """The steps of each of B recordings, at most `length` -> (T, B) on the host; what is missing
+    looks at nothing."""
+    looks = np.zeros((length, len(groups)), bool)
+    share = np.ones((length, len(groups)), np.float32)
+    for b, group in enumerate(groups):
+        looks[: len(group), b] = [step.time is not None for step in group]
+        share[: len(group), b] = [step.share for step in group]
+    return Looks(looks, share)
+
+
+# --- From events to pictures
+
+
 class Session(NamedTuple):
     """All that must be kept between two chunks of B recordings."""
 
-    network: State
+    network: State | Committed
     display: DisplayState
     channels: "Session | None" = None
     """The same of red, green and blue, leading axes (B, 3); None without colours."""
 
 
-def initial_session(batch: int, height: int, width: int, network: Network) -> Session:
-    """Raises ValueError for colours of a sensor with an odd side."""
+def initial_session(
+    batch: int, height: int, width: int, network: Network, at_times: bool = False
+) -> Session:
+    """at_times: for steps of which some only look, see `reconstruct_at`.
+    Raises ValueError for colours of a sensor with an odd side."""
     (top, bottom), (left, right) = padding(height, width, network.pad)
     state = initial_state(batch, top + height + bottom, left + width + right)
+    state = Committed(state, state) if at_times else state
     channels = None
     if network.color:
         colour.check_sides(height, width)
         grey = replace(network, color=False)
-        channels = _unfold(initial_session(3 * batch, height // 2, width // 2, grey))
+        channels = initial_session(3 * batch, height // 2, width // 2, grey, at_times)
+        channels = _unfold(channels)
     return Session(state, initial_display_state(batch), channels)
 
 
@@ -232,19 +385,21 @@ def padding(height: int, width: int, multiple: int) -> tuple[tuple[int, int], tu
 
 @partial(
     jax.jit,
-    static_argnames=("height", "width", "network", "settings", "preview", "mesh"),
+    static_argnames=("height", "width", "network", "settings", "preview", "raw", "mesh"),
 )
 def events_to_pictures(
     weights: Weights,
     session: Session,
     events: Packed,
     valid: jax.Array,
+    steps: Looks | None = None,
     *,
     height: int,
     width: int,
     network: Network = Network(),
     settings: Display = Display(),
     preview: bool = False,
+    raw: bool = False,
     mesh: Mesh | None = None,
 ) -> tuple[Session, jax.Array]:
     """(Session, the events of T x B windows) -> (Session, pictures), as one compiled program.
@@ -253,6 +408,8 @@ def events_to_pictures(
     (T, B, H, W) uint8, with colours (T, B, H, W, 3); with preview (T, B, H, 2 W, 3): the events
     beside the reconstruction.
     valid: (T, B) bool, as in `reconstruct`.
+    steps: which only look, for a session `at_times`; pictures of those that are kept mean nothing.
+    raw: images as the network gives them, (T, B, H, W) float32, in place of pictures.
     mesh: devices that share the B recordings equally, for events from `pack_for_devices`.
     """
     # Numbers are normalised before they are padded or dealt out to colours.
@@ -263,29 +420,41 @@ def events_to_pictures(
     def all_at_once(weights, state, inputs, valid):
         return run(replace(weights, normalise=False), state, normalise(inputs), valid)
 
-    def shown(weights, session, inputs, valid):
+    def shown(weights, session, inputs, valid, steps):
         height, width = inputs.shape[2:4]
         (top, bottom), (left, right) = sides = padding(height, width, network.pad)
         inputs = jnp.pad(inputs, ((0, 0), (0, 0), *sides, (0, 0)), mode="reflect")
-        arguments = weights, session.network, inputs, valid
-        if early or not weights.normalise:
-            state, images = run(replace(weights, normalise=False), *arguments[1:])
+        if steps is not None:
+            ready = replace(weights, normalise=weights.normalise and not early)
+            state, images = reconstruct_at(
+                ready, session.network, inputs, steps, valid,
+                recurrent=network.recurrent, dtype=dtype,
+            )  # fmt: skip
+            valid = valid & steps.looks
+        elif early or not weights.normalise:
+            plain = replace(weights, normalise=False)
+            state, images = run(plain, session.network, inputs, valid)
         else:  # an accelerator normalises all windows at once, a CPU as part of each step
+            arguments = weights, session.network, inputs, valid
             state, images = jax.lax.platform_dependent(*arguments, cpu=run, default=all_at_once)
+        if raw:
+            images = images[:, :, top : top + height, left : left + width]
+            return Session(state, session.display), images
         # The original program crops last: its mask and its range see the padded image.
         ranges, greys = display(session.display, images, valid, settings)
         greys = greys[:, :, top : top + height, left : left + width]
         return Session(state, ranges), greys
 
-    def one_device(weights, session, events, valid):
+    def one_device(weights, session, events, valid, steps):
         tensors = voxelise(events, height=height, width=width)
         inputs = normalise(tensors) if early else tensors
-        after, pictures = shown(weights, session, inputs, valid)
+        after, pictures = shown(weights, session, inputs, valid, steps)
         if network.color:
             planes = colour.channels(inputs)  # (T, B, 3, H/2, W/2, 5)
             planes = planes.reshape(len(planes), -1, *planes.shape[3:])
+            each = partial(jnp.repeat, repeats=3, axis=1)
             channels, shades = shown(
-                weights, _fold(session.channels), planes, jnp.repeat(valid, 3, 1)
+                weights, _fold(session.channels), planes, *jax.tree.map(each, (valid, steps))
             )
             shades = shades.reshape(len(planes), -1, 3, *shades.shape[2:])
             pictures = colour.coloured(pictures, shades)
@@ -297,6 +466,6 @@ def events_to_pictures(
         return after, pictures
 
     if mesh is not None:
-        specs = EVERYWHERE, BATCH, IN_LISTS, TIME_BATCH
+        specs = REPLICATED, BATCH, IN_LISTS, TIME_BATCH, TIME_BATCH
         one_device = on_each_device(one_device, specs, (BATCH, TIME_BATCH), mesh)
-    return one_device(weights, session, events, valid)
+    return one_device(weights, session, events, valid, steps)

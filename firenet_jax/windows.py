@@ -40,8 +40,8 @@ class Windows:
     """A window holds this many events per pixel of the sensor (0.35 if nothing is chosen)."""
     duration: Annotated[float | None, tyro.conf.arg(aliases=["-T"])] = None
     """A window lasts this many milliseconds, on a grid that starts at the first event."""
-    between_frames: bool = False
-    """A window lasts from one of the camera's frames to the next."""
+    between_frames: Annotated[bool, tyro.conf.arg(name="frame-to-frame")] = False
+    """A window lasts from one of the camera's frames to the next, however many events that are."""
     step: float | None = None
     """Windows start this far apart, in events (or ms, with --duration): less than the window
     makes them overlap."""
@@ -54,7 +54,7 @@ class Windows:
         if sum(way is not None for way in ways) > 1:
             raise ValueError(
                 "windows are cut in one way: choose one of --events, --events-per-pixel, "
-                "--duration and --between-frames"
+                "--duration and --frame-to-frame"
             )
         for name in ("events", "events_per_pixel", "duration", "step", "longest"):
             value = getattr(self, name)

@@ -21,6 +21,7 @@ WEIGHTS = Path(fj.__file__).parent / "weights" / "firenet.npz"
 # Arguments that leave next to nothing to do. {recording} is a small one, {folder} where it lies.
 SMALL = {
     "bfloat16": f"{WEIGHTS} {{recording}} --windows 12",
+    "calibration": "--seconds 0.3",
     "colour_mosaic": "--windows 4",
     "compare_losses": "{folder}/runs --steps 1 --only l1",
     "compare_optimisers": "{folder}/runs --steps 1 --only 'muon, rate 3e-3'",
@@ -105,7 +106,7 @@ def test_no_script_is_forgotten():
 @pytest.mark.parametrize("name", SMALL)
 def test_runs(name, tmp_path):
     script = (EXPERIMENTS / f"{name}.py").read_text()
-    for library in re.findall(r"^import (torch|pandas)$", script, re.MULTILINE):
+    for library in re.findall(r"^import (torch|pandas|cv2)$", script, re.MULTILINE):
         if importlib.util.find_spec(library) is None:
             pytest.skip(f"needs {library}")
     # A copy, because scripts write beside themselves.

@@ -132,11 +132,11 @@ def interrupt_after(monkeypatch, pictures):
     """The program dies while it writes a picture: half of the file is there."""
     original = FolderWriter.write
 
-    def write(self, picture, time):
+    def write(self, picture, *of):
         if self.count == pictures:
             (self.partial / f"frame_{self.count:010d}.png").write_bytes(b"half")
             raise Interrupted
-        original(self, picture, time)
+        original(self, picture, *of)
 
     monkeypatch.setattr(FolderWriter, "write", write)
 
@@ -403,7 +403,7 @@ def test_nothing_runs_on_after_an_error_that_is_kept(tmp_path, weights, monkeypa
     """As a notebook keeps the last one, and with it all that was going on."""
     recording = write_recording(tmp_path / "a.txt", 30_000)
 
-    def full(self, picture, time):
+    def full(self, *args):
         raise OSError("no room")
 
     monkeypatch.setattr(FolderWriter, "write", full)

@@ -21,7 +21,7 @@ LAYERS = [
     ["events", "colour", "convolution", "pictures", "warp", "devices"],
     ["blocks"],
     ["storage", "windows", "network"],
-    ["readers", "tensors", "checkpoint", "filters"],
+    ["readers", "tensors", "checkpoint", "filters", "instants"],
     ["reconstruction", "simulation"],
     ["evaluation", "export", "live"],
     ["training"],
@@ -32,11 +32,11 @@ LAYERS = [
 DOORS = {
     "flax": {"network", "evaluation.baselines"}, "optax": {"training.step"},
     "orbax": {"training.run"}, "torch": set(), "av": {"storage.video", "commands.simulate"},
-    "h5py": {"readers", "training.batches", "commands.simulate"},
+    "h5py": {"readers", "training.batches", "commands.simulate", "storage.arrays"},
     "pyarrow": {"readers"}, "grain": {"training.batches"}, "faery": {"readers"},
-    "rosbags": {"readers"}, "hdf5plugin": {"readers"}, "skimage": {"evaluation.equalise"},
-    "llvmlite": {"native"}, "onnx": {"export"}, "safetensors": {"export"},
-    "flatbuffers": {"export"},
+    "rosbags": {"readers", "storage.bag"}, "hdf5plugin": {"readers"},
+    "skimage": {"evaluation.equalise"}, "llvmlite": {"native"}, "onnx": {"export"},
+    "safetensors": {"export"}, "flatbuffers": {"export"},
 }  # fmt: skip
 
 

@@ -7,6 +7,7 @@ the recordings. The host cuts windows and writes; everything between is the comp
 recordings.
 """
 
+import copy
 import dataclasses
 import hashlib
 import itertools
@@ -17,7 +18,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -26,13 +27,25 @@ from tqdm import tqdm
 
 from firenet_jax import filters
 from firenet_jax.checkpoint import load_weights
-from firenet_jax.devices import BATCH, EVERYWHERE, in_a_row, share, shared
-from firenet_jax.errors import RecordingError, logger
-from firenet_jax.events import Events, Recording, counted, parse_size, rate_in_words, until_damage
+from firenet_jax.commands.times import Times, times_of
+from firenet_jax.devices import BATCH, REPLICATED, device_mesh, sharding, share
+from firenet_jax.errors import RecordingError, SettingsError, logger
+from firenet_jax.events import Events, Recording, counted, rate_in_words, until_damage
+from firenet_jax.instants import Counts, Grid, Step, check, steps
 from firenet_jax.network import Weights
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
-from firenet_jax.reconstruction import Network, Session, events_to_pictures, initial_session
+from firenet_jax.reconstruction import (
+    Looks,
+    Network,
+    Session,
+    events_to_pictures,
+    initial_session,
+    looks_of,
+)
+from firenet_jax.settings import parse_size
+from firenet_jax.storage.arrays import ArraysWriter
+from firenet_jax.storage.bag import BagWriter, check_topic
 from firenet_jax.storage.files import (
     OutputError,
     identity,
@@ -48,6 +61,7 @@ from firenet_jax.storage.screen import Screen, check_screen
 from firenet_jax.storage.video import (
     OTHER_FILES,
     VIDEOS,
+    WHOLE,
     FolderWriter,
     VideoWriter,
     check_free,
@@ -57,12 +71,13 @@ from firenet_jax.storage.video import (
     open_writer,
 )
 from firenet_jax.tensors import IN_LISTS, Packed, pack_for_devices
-from firenet_jax.windows import LONGEST, Window, Windows, cut, in_words, usual
+from firenet_jax.windows import LONGEST, Windows, cut, in_words, usual
 
 # Settings that the pictures do not depend on (on the chunk only in float32's last bits), or that
 # are told in another way.
 ELSEWHERE = ("recordings", "output", "weights", "fps", "speed", "chunk", "batch", "overwrite")
 ELSEWHERE += ("columns", "strict", "processes", "process", "show")
+Writer = FolderWriter | VideoWriter | ArraysWriter | BagWriter
 RESUME_EVERY = 5.0  # seconds between two saves of what a resumed run needs
 
 
@@ -74,6 +89,8 @@ class Reconstruct:
       firenet reconstruct recording.zip -o video.mp4
       firenet reconstruct recording.raw -o frames/ --duration 20
       firenet reconstruct a.aedat4 b.aedat4 -o videos.mp4       (videos/a.mp4, videos/b.mp4)
+      firenet reconstruct recording.raw -o slow.mp4 --rate 3000 --speed 0.01
+      firenet reconstruct recording.raw -o cam0.bag --at times.txt
     """
 
     recordings: Annotated[
@@ -82,12 +99,14 @@ class Reconstruct:
     ]
     """Text, zip, HDF5, ECD or EVREAL folder, .bin, .dat, .raw, .aedat, .aedat4, .es, ROS bag."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """A folder (for png files and timestamps.txt), or a name that ends in .mp4 or .gif. With
-    several recordings one entry each, named after them, in the folder of that name."""
+    """A folder (for png files and timestamps.txt), or a name that ends in .mp4, .gif, .h5 (float32
+    images), .bag (ROS 1) or .ros2 (ROS 2). With several recordings one entry each, named after
+    them, in the folder of that name."""
     weights: Annotated[Path | None, tyro.conf.arg(aliases=["-c"])] = None
     """Weights: .npz, a published PyTorch checkpoint, or the folder of a training run. Without:
     those that come with the package."""
     windows: Windows = Windows()
+    times: Times = Times()
     display: Display = Display()
     network: Network = Network()
     preview: bool = False
@@ -108,6 +127,13 @@ class Reconstruct:
     where a recording is so short that nobody could see it."""
     fps: float | None = None
     """Show each picture of a video for as long, so many per second, whatever its time."""
+    names: Literal["number", "nanoseconds"] = "number"
+    """Name the png files of --rate, --at, --between-frames or --triggers by their time, as Kalibr
+    takes them."""
+    topic: str = "/cam0/image_raw"
+    """Of the images in a bag."""
+    frame_id: str = "cam0"
+    """The frame of coordinates that images in a bag name."""
     sensor_size: str | None = None
     """WIDTHxHEIGHT of the sensor, such as 240x180, where the recording does not say it."""
     columns: str | None = None
@@ -132,19 +158,31 @@ class Reconstruct:
         if self.fps is not None:
             check_rate(self.output, self.fps)
             if self.speed is not None:
-                raise ValueError("fps and speed: a video has one or the other, leave one out")
+                raise SettingsError("fps and speed: a video has one or the other, leave one out")
         if self.speed is not None and not 1e-6 <= self.speed <= 1e6:
-            raise ValueError(f"speed is {self.speed}, but must be more than 0; 1 is real time")
+            raise SettingsError(f"speed is {self.speed}, but must be more than 0; 1 is real time")
         for name in ("chunk", "batch"):
             value = getattr(self, name)
             if value is not None and not value > 0:
-                raise ValueError(f"{name} is {value}, but must be more than 0")
+                raise SettingsError(f"{name} is {value}, but must be more than 0")
         if self.network.pad < 1:
-            raise ValueError(f"pad is {self.network.pad}, but pads to a multiple of 1 or more")
+            raise SettingsError(f"pad is {self.network.pad}, but pads to a multiple of 1 or more")
         if not self.recordings:
-            raise ValueError("no recording: name one or more files or folders")
+            raise SettingsError("no recording: name one or more files or folders")
         filters.check_span(self.start, self.stop)
         share(self.process, self.processes)
+        check_topic(self.topic)
+        if self.times.wanted:
+            check(self.windows)
+        elif self.names == "nanoseconds":
+            raise SettingsError(
+                "pictures are named by their time where it is chosen: with --rate, --at, "
+                "--between-frames or --triggers"
+            )
+        if self.output.suffix == ".h5" and (self.preview or self.network.color):
+            raise SettingsError(
+                ".h5 holds images as the network gives them: leave out --preview and --color"
+            )
 
 
 class Job(NamedTuple):
@@ -155,6 +193,7 @@ class Job(NamedTuple):
     record: str  # JSON of all that the pictures depend on; a resumed run must have the same
     windows: Windows = Windows()  # as asked for, or as they suit the recording
     speed: float = 1.0  # at which a video plays
+    times: np.ndarray | Grid | None = None  # of the images; None: one for each window
 
 
 @dataclass
@@ -162,41 +201,61 @@ class Running:
     """A job that has a slot."""
 
     job: Job
-    windows: Iterator[Window]
-    ahead: Window | None  # the next window; None after the last
-    reached: int  # windows taken so far, those of an earlier run among them
+    steps: Iterator[Step]
+    ahead: Step | None  # the next step; None after the last
+    reached: int  # steps taken so far, those of an earlier run among them
+    pictures: int  # of these
     events: list[int]  # how many were read so far
-    writer: FolderWriter | VideoWriter
-    error: RecordingError | None = None  # that ended its windows before their time
+    writer: Writer
+    counts: Counts | None  # of times at which images are wanted
+    error: RecordingError | None = None  # that ended its steps before their time
 
-    def take(self, count: int) -> list[Window]:
-        """The next `count` windows, or as many as there are."""
+    def take(self, count: int) -> list[Step]:
+        """The next `count` steps, or as many as there are."""
         taken = []
         while self.ahead is not None and len(taken) < count:
             taken.append(self.ahead)
             try:
-                self.ahead = next(self.windows, None)
+                self.ahead = next(self.steps, None)
             except RecordingError as error:
                 self.ahead, self.error = None, error
         self.reached += len(taken)
+        self.pictures += sum(step.time is not None for step in taken)
+        if self.ahead is None and self.error is None and self.counts is not None:
+            self.error = told(self.job.recording, self.counts)
         return taken
+
+
+def told(recording: Recording, counts: Counts) -> RecordingError | None:
+    """Says which times lie outside the recording; an error where all do."""
+    outside = f"{counts.early} before its first event, {counts.late} after its last one"
+    if not counts.seen:
+        return RecordingError(
+            f"{recording.path}: no image is wanted while it lasts ({outside}): choose other times"
+        )
+    if counts.early or counts.late:
+        logger.warning("%s: times without an image: %s", recording.path, outside)
+    return None
 
 
 class Part(NamedTuple):
     """What a chunk holds of one recording."""
 
     running: Running
-    times: list[int]  # of its windows, microseconds
-    reached: int  # windows of the recording up to the last of these
-    ends: bool  # no windows follow
+    times: list[int | None]  # of its images, microseconds; None: a step without one
+    counts: list[int]  # of their events
+    reached: int  # steps of the recording up to the last of these
+    pictures: int  # of these
+    ends: bool  # no steps follow
 
 
 class Chunk(NamedTuple):
-    """T x B windows on their way to the device, and whose they are."""
+    """T x B steps on their way to the device, and whose they are."""
 
     events: Packed
     count: int  # events
     valid: np.ndarray  # (T, B) bool
+    looks: Looks | None  # None: each is a window, which has an image
     parts: dict[int, Part]  # by slot
     starts: dict[int, Session]  # by slot: a new recording begins here, from this state
 
@@ -221,7 +280,7 @@ def run(settings: Reconstruct) -> list[Path]:
         if not done_file(output).is_file():
             check_output(output, settings.overwrite)
     size = parse_size(settings.sensor_size)
-    jobs = []
+    jobs, failed = [], {}
     for path, output in zip(settings.recordings[mine], outputs, strict=True):
         recording = open_recording(path, size, settings.strict, settings.columns)
         if settings.network.color and recording.grey:
@@ -230,15 +289,21 @@ def run(settings: Reconstruct) -> list[Path]:
                 "it out"
             )
         windows, speed = windows_for(recording, settings)
+        try:
+            times = times_of(settings.times, recording, part_of(recording, settings))
+        except RecordingError as error:
+            failed[output] = error
+            continue
         chosen = dataclasses.replace(settings, windows=windows)
-        job = Job(recording, output, describe(chosen, recording, weights), windows, speed)
+        record = describe(chosen, recording, weights, times)
+        job = Job(recording, output, record, windows, speed, times)
         if is_done(job):
             logger.warning("%s: done by the run that this one continues", output)
             continue
         check_output(output, settings.overwrite)
         check_position(job, settings)
         jobs.append(job)
-    began, failed, said = time.monotonic(), {}, {}
+    began, said = time.monotonic(), {}
     counts = [job.recording.count for job in jobs]
     partly = settings.start or settings.stop or settings.windows.step
     known = None if None in counts or partly else sum(counts)
@@ -249,7 +314,7 @@ def run(settings: Reconstruct) -> list[Path]:
             reconstruct_jobs(same, settings, weights, progress, failed, said, read)
     seconds = time.monotonic() - began
     if said:
-        print(closing_line(said, {job.output: job for job in jobs}, seconds))
+        print(closing_line(said, {job.output: job for job in jobs}, seconds, settings.times))
     if failed:
         rest = "; the other recordings are done" if said else ""
         raise RecordingError("; ".join(map(str, failed.values())) + rest)
@@ -263,16 +328,20 @@ def windows_for(recording: Recording, settings: Reconstruct) -> tuple[Windows, f
     """The windows, and the speed of a video: those asked for, or what suits the recording."""
     windows, speed = settings.windows, settings.speed or 1.0
     if windows == Windows():
-        chunks = recording.events()
-        if settings.start is not None or settings.stop is not None:
-            chunks = filters.between(chunks, settings.start, settings.stop)
         try:
-            windows = usual(until_damage(chunks))
+            windows = usual(until_damage(part_of(recording, settings)))
         except RecordingError:  # told when its events are read, so that others are done
             windows = Windows(longest=LONGEST)
         if settings.speed is None and windows.longest < LONGEST / 2:  # gone in 0.4 s
             speed = windows.longest / LONGEST
     return windows, speed
+
+
+def part_of(recording: Recording, settings: Reconstruct) -> Iterator[Events]:
+    """Its events from --start to --stop."""
+    if settings.start is None and settings.stop is None:
+        return recording.events()
+    return filters.between(recording.events(), settings.start, settings.stop)
 
 
 class Said(NamedTuple):
@@ -283,12 +352,16 @@ class Said(NamedTuple):
     slower: float | None  # than reality, of a video
 
 
-def closing_line(said: dict[Path, Said], jobs: dict[Path, Job], seconds: float) -> str:
+def closing_line(
+    said: dict[Path, Said], jobs: dict[Path, Job], seconds: float, times: Times = Times()
+) -> str:
     """ "video.mp4: 59 pictures of 78,830 events in 15.0 s (...), windows of ...; in real time" """
     pictures, events = (sum(column) for column in list(zip(*said.values(), strict=True))[:2])
     ways = {in_words(jobs[output].windows, jobs[output].recording.pixels) for output in said}
     if len(ways) > 1:
         ways = {"windows as they suit each recording"}
+    if times.wanted:
+        ways = {f"{times.in_words()}, the state by {way}" for way in ways}
     factors = [entry.slower for entry in said.values() if entry.slower is not None]
     plays = ""
     if factors:
@@ -319,7 +392,7 @@ def plan(recordings: tuple[Path, ...], output: Path) -> list[Path]:
         raise OutputError(
             f"two recordings are named {twice} and would write the same output: run them apart"
         )
-    if output.suffix in VIDEOS:
+    if output.suffix in WHOLE:
         return [followed(output.with_suffix("") / f"{stem}{output.suffix}") for stem in stems]
     return [followed(output / stem) for stem in stems]
 
@@ -378,10 +451,10 @@ def reconstruct_jobs(
     height, width = jobs[0].recording.height, jobs[0].recording.width
     wanted = min(settings.batch or jax.local_device_count(), len(jobs))
     count = min(wanted, jax.local_device_count())
-    mesh = in_a_row(jax.local_devices()[:count]) if count > 1 else None
+    mesh = device_mesh(jax.local_devices()[:count]) if count > 1 else None
     slots = -(-wanted // count) * count  # the same number on each device; some may stay empty
-    weights = jax.device_put(weights, shared(EVERYWHERE, mesh) if mesh else None)
-    writers: dict[Path, FolderWriter | VideoWriter] = {}  # of jobs that are not done
+    weights = jax.device_put(weights, sharding(REPLICATED, mesh) if mesh else None)
+    writers: dict[Path, Writer] = {}  # of jobs that are not done
     chunks = ahead(in_chunks(jobs, settings, slots, count, failed, writers), depth=1)
 
     def device():
@@ -390,7 +463,8 @@ def reconstruct_jobs(
         An accelerator has the next chunk before the last one's pictures are fetched, so that it
         never waits. A CPU has not: it would gain nothing, and each chunk in flight holds memory.
         """
-        session, sent = initial_session(slots, height, width, settings.network), deque()
+        session = initial_session(slots, height, width, settings.network, settings.times.wanted)
+        sent = deque()
         in_flight = 1 if jax.default_backend() == "cpu" else 2
         saved = time.monotonic()
         for chunk in chunks:
@@ -398,20 +472,21 @@ def reconstruct_jobs(
                 session = _set_slot(session, slot, start)
             events = chunk.events
             if mesh:
-                session = jax.device_put(session, shared(BATCH, mesh))
+                session = jax.device_put(session, sharding(BATCH, mesh))
                 events = jax.tree.map(
-                    lambda a, spec: jax.device_put(a, shared(spec, mesh)), events, IN_LISTS
+                    lambda a, spec: jax.device_put(a, sharding(spec, mesh)), events, IN_LISTS
                 )
             session, shown = events_to_pictures(
-                weights, session, events, chunk.valid, height=height, width=width, mesh=mesh,
+                weights, session, events, chunk.valid, chunk.looks, height=height, width=width,
                 network=settings.network, settings=settings.display, preview=settings.preview,
+                raw=settings.output.suffix == ".h5", mesh=mesh,
             )  # fmt: skip
             states = {}
             if time.monotonic() - saved > RESUME_EVERY:
                 states = {
                     slot: _get_slot(session, slot)
                     for slot, part in chunk.parts.items()
-                    if part.running.job.output.suffix not in VIDEOS and not part.ends
+                    if part.running.job.output.suffix not in WHOLE and not part.ends
                 }
                 saved = time.monotonic()
             sent.append((chunk, shown, states))
@@ -431,13 +506,15 @@ def reconstruct_jobs(
     try:
         for chunk, shown in finished:
             for slot, part in chunk.parts.items():
-                running, times = part.running, part.times
-                for picture, time_of in zip(shown[:, slot], times, strict=False):
-                    running.writer.write(picture, time_of)
-                    if screen and slot == min(chunk.parts):
-                        screen.show(picture, str(running.job.output))
+                running = part.running
+                for image, *of in zip(shown[:, slot], part.times, part.counts, strict=False):
+                    if of[0] is not None:
+                        running.writer.write(image, *of)
+                        if screen and slot == min(chunk.parts):
+                            screen.show(image, str(running.job.output))
                 output = running.job.output
-                pictures_done[output] = pictures_done.get(output, 0) + len(times)
+                wanted = sum(time_of is not None for time_of in part.times)
+                pictures_done[output] = pictures_done.get(output, 0) + wanted
                 if part.ends and running.error:
                     failed[running.job.output] = running.error
                     writers.pop(running.job.output).abandon()
@@ -491,13 +568,13 @@ def in_chunks(
     slots: int,
     devices: int,
     failed: dict[Path, RecordingError],
-    writers: dict[Path, FolderWriter | VideoWriter],
+    writers: dict[Path, Writer],
 ) -> Iterator[Chunk]:
-    """Jobs -> chunks of T x B windows, B the slots; a free slot takes the next job.
+    """Jobs -> chunks of T x B steps, B the slots; a free slot takes the next job.
 
     writers: where those that were opened go, by their output.
     """
-    steps = settings.chunk or chunk_for(jobs[0].recording.pixels)
+    length = settings.chunk or chunk_for(jobs[0].recording.pixels)
     waiting = iter(jobs)
     running: dict[int, Running] = {}
     size = 0
@@ -511,44 +588,58 @@ def in_chunks(
                     failed[job.output] = error
         if not running:
             return
-        rows = [[Events.empty()] * slots for _ in range(steps)]
-        valid = np.zeros((steps, slots), bool)
-        parts = {}
+        rows = [[Events.empty()] * slots for _ in range(length)]
+        valid = np.zeros((length, slots), bool)
+        parts, taken = {}, [[]] * slots
         for slot, job in list(running.items()):
-            windows = job.take(steps)
-            for t, window in enumerate(windows):
-                rows[t][slot] = window.events
-            valid[: len(windows), slot] = True
-            times = [window.time for window in windows]
-            parts[slot] = Part(job, times, job.reached, job.ahead is None)
+            taken[slot] = job.take(length)
+            for t, step in enumerate(taken[slot]):
+                rows[t][slot] = step.events
+            valid[: len(taken[slot]), slot] = True
+            times = [step.time for step in taken[slot]]
+            sizes = [len(step.events) for step in taken[slot]]
+            ends = job.ahead is None
+            parts[slot] = Part(job, times, sizes, job.reached, job.pictures, ends)
             if job.ahead is None:
                 del running[slot]
-        count = sum(len(events) for row in rows for events in row)
+        looking = settings.times.wanted  # then events count in the step that keeps them
+        count = sum(
+            len(step.events)
+            for group in taken
+            for step in group
+            if not looking or step.time is None
+        )
         events = pack_for_devices(rows, devices, size)
         size = len(events.t) // devices
-        yield Chunk(events, count, valid, parts, starts)
+        looks = looks_of(taken, length) if looking else None
+        yield Chunk(events, count, valid, looks, parts, starts)
 
 
-def start(
-    job: Job, settings: Reconstruct, writers: dict[Path, FolderWriter | VideoWriter]
-) -> tuple[Running, Session]:
-    """Opens the stream of a job's windows, after those that an interrupted run has finished."""
+def start(job: Job, settings: Reconstruct, writers: dict[Path, Writer]) -> tuple[Running, Session]:
+    """Opens the stream of a job's steps, after those that an interrupted run has finished."""
     # First of all, as it keeps other runs from what is read and removed here.
-    writer = writers[job.output] = open_writer(job.output, settings.fps, job.speed)
+    writer = writers[job.output] = writer_of(job, settings)
     try:
         recording = job.recording
         span: list[int] = []
-        chunks = timed(recording.events(), span)
-        if settings.start is not None or settings.stop is not None:
-            chunks = filters.between(chunks, settings.start, settings.stop)
+        timed_recording = dataclasses.replace(
+            recording, events=lambda: timed(recording.events(), span)
+        )
+        chunks = part_of(timed_recording, settings)
         if settings.hot_pixels is not None:
             chunks = filters.without(chunks, hot_pixels(settings.hot_pixels, recording))
         if settings.flip:
             chunks = filters.turned(chunks, recording.height, recording.width)
         events: list[int] = []
-        windows = cut(recording, job.windows, numbered(chunks, events))
-        done, session = load_position(job, settings)
-        first = next(itertools.islice(windows, done, None), None)
+        chunks, counts = numbered(chunks, events), None
+        if job.times is None:
+            windows = cut(recording, job.windows, chunks)
+            entries = (Step(window.events, window.time, 1.0) for window in windows)
+        else:
+            counts, times = Counts(), copy.copy(job.times)  # a grid counts on
+            entries = steps(recording, job.windows, times, chunks, counts)
+        done, pictures, session = load_position(job, settings)
+        first = next(itertools.islice(entries, done, None), None)
         if first is None and not done:
             lasts = f": it lasts {(span[1] - span[0]) / 1e6:g} s" if span else ""
             raise RecordingError(
@@ -558,9 +649,19 @@ def start(
         writers.pop(job.output).abandon()
         raise
     if done:
-        writer.keep(done)
+        writer.keep(pictures)
         events.clear()  # those of the pictures that are there
-    return Running(job, windows, first, done, events, writer), session
+    return Running(job, entries, first, done, pictures, events, writer, counts), session
+
+
+def writer_of(job: Job, settings: Reconstruct) -> Writer:
+    output = job.output
+    if output.suffix == ".h5":
+        return ArraysWriter(output)
+    if output.suffix in (".bag", ".ros2"):
+        return BagWriter(output, settings.topic, settings.frame_id)
+    by_time = settings.names == "nanoseconds"
+    return open_writer(output, settings.fps, job.speed, settings.times.wanted, by_time)
 
 
 def timed(chunks: Iterator[Events], span: list[int]) -> Iterator[Events]:
@@ -586,7 +687,12 @@ def hot_pixels(choice: str, recording: Recording) -> np.ndarray:
     return filters.read_hot_pixels(choice, recording.height, recording.width)
 
 
-def describe(settings: Reconstruct, recording: Recording, weights: Weights) -> str:
+def describe(
+    settings: Reconstruct,
+    recording: Recording,
+    weights: Weights,
+    times: np.ndarray | Grid | None = None,
+) -> str:
     """All that the pictures depend on, as JSON."""
     digest = hashlib.sha256(str(weights.normalise).encode())
     for path, leaf in jax.tree_util.tree_leaves_with_path(weights.params):
@@ -594,6 +700,10 @@ def describe(settings: Reconstruct, recording: Recording, weights: Weights) -> s
     choices = dataclasses.asdict(settings)
     for name in ELSEWHERE:
         del choices[name]
+    if isinstance(times, np.ndarray):  # not the name of their file
+        choices["times"] = hashlib.sha256(times.tobytes()).hexdigest()
+    if settings.output.suffix not in (".bag", ".ros2"):
+        del choices["topic"], choices["frame_id"]
     if settings.hot_pixels not in (None, "auto"):  # what the file holds counts, not its name
         hot = hot_pixels(settings.hot_pixels, recording)
         choices["hot_pixels"] = hashlib.sha256(hot.tobytes()).hexdigest()
@@ -624,7 +734,8 @@ def keep_position(part: Part, session: Session) -> None:
     with writing(job.output):
         path = kept_file(part)
         path.parent.mkdir(exist_ok=True)
-        np.savez(path, record=job.record, pictures=part.reached, **leaves)
+        places = {"steps": part.reached, "pictures": part.pictures}
+        np.savez(path, record=job.record, **places, **leaves)
 
 
 def publish_position(part: Part) -> None:
@@ -641,7 +752,7 @@ def check_position(job: Job, settings: Reconstruct) -> dict[str, np.ndarray] | N
     Raises OutputError where another run has left something, which `overwrite` allows to replace.
     """
     path = position_file(job)
-    if job.output.suffix in VIDEOS or not path.exists():
+    if job.output.suffix in WHOLE or not path.exists():
         return None
     saved = read_arrays(path)
     if str(saved.get("record")) == job.record:
@@ -654,11 +765,11 @@ def check_position(job: Job, settings: Reconstruct) -> dict[str, np.ndarray] | N
     return None
 
 
-def load_position(job: Job, settings: Reconstruct) -> tuple[int, Session]:
-    """(pictures on disk, the state after them) of an interrupted run; (0, the initial state) if
-    there is none."""
+def load_position(job: Job, settings: Reconstruct) -> tuple[int, int, Session]:
+    """(steps done, their pictures on disk, the state after them) of an interrupted run; (0, 0, the
+    initial state) if there is none."""
     height, width = job.recording.height, job.recording.width
-    initial = initial_session(1, height, width, settings.network)
+    initial = initial_session(1, height, width, settings.network, settings.times.wanted)
     initial = jax.tree.map(lambda leaf: leaf[0], initial)
     path = position_file(job)
     for unpublished in path.parent.glob("resume.*.npz"):
@@ -667,12 +778,12 @@ def load_position(job: Job, settings: Reconstruct) -> tuple[int, Session]:
     if saved is None:
         if path.is_file():
             path.unlink()
-        return 0, initial
+        return 0, 0, initial
     tree = jax.tree.structure(initial)
     try:
-        done = int(saved["pictures"])
+        done, pictures = int(saved["steps"]), int(saved["pictures"])
         session = tree.unflatten([saved[f"state{i}"] for i in range(tree.num_leaves)])
     except KeyError as error:  # of another version of this program
         raise OutputError(f"{path} lacks {error}: remove it and run again") from error
-    logger.warning("%s: going on after %d pictures", job.output, done)
-    return done, session
+    logger.warning("%s: going on after %d pictures", job.output, pictures)
+    return done, pictures, session

@@ -19,9 +19,16 @@ import numpy as np
 from PIL import Image
 
 from firenet_jax.errors import OutputError
+from firenet_jax.storage import bag
 from firenet_jax.storage.files import lock_file, locked, partial_name, writing
 
 VIDEOS = (".mp4", ".gif")
+WHOLE = (
+    *VIDEOS,
+    ".h5",
+    ".bag",
+    ".ros2",
+)  # what is made in one go; anything else is a folder of png
 # What is no folder's name: a dot alone, as in out_0.35, does not make a file of it.
 OTHER_FILES = (
     ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".png", ".apng", ".jpg",
@@ -30,7 +37,7 @@ OTHER_FILES = (
     ".bag", ".db3", ".mcap",
 )  # fmt: skip
 LIKE_A_FILE = re.compile(r"\.[A-Za-z][A-Za-z0-9]{2,4}")  # nor is any other such ending
-OURS = re.compile(r"timestamps\.txt|resume[.\w]*\.npz|frame_\d{10,}\.png")  # in a folder
+OURS = re.compile(r"timestamps\.txt|resume[.\w]*\.npz|(frame_\d{10,}|\d{19})\.png")  # in a folder
 RATES = 0.01, 10_000  # pictures per second
 GIF_RATE = 100  # pictures per second, the most that the format can say
 MP4_CLOCK = 90_000  # ticks per second, as is usual
@@ -46,7 +53,7 @@ def followed(path: Path) -> Path:
         target = path.resolve()
     except (OSError, RuntimeError) as error:
         raise OutputError(f"{path}: points to itself: choose another output") from error
-    folder = target.is_dir() and path.suffix not in VIDEOS
+    folder = target.is_dir() and path.suffix not in WHOLE
     return target if target.suffix == path.suffix or folder else path
 
 
@@ -63,15 +70,18 @@ def check_rate(path: Path, fps: float) -> None:
 
 def check_output(path: Path, overwrite: bool) -> None:
     """Raises OutputError if something is at the final name that must not or cannot be replaced."""
-    other = path.suffix.lower() in (*VIDEOS, *OTHER_FILES)
+    other = path.suffix.lower() in (*WHOLE, *OTHER_FILES)
     other |= LIKE_A_FILE.fullmatch(path.suffix) is not None and not path.is_dir()
-    if other and path.suffix not in VIDEOS:
+    if other and path.suffix not in WHOLE:
         raise OutputError(
-            f"{path}: cannot write {path.suffix} files: name a folder (for png), .mp4 or .gif"
+            f"{path}: cannot write {path.suffix} files: name a folder (for png), .mp4, .gif, .h5, "
+            ".bag or .ros2"
         )
-    if path.is_dir() and path.suffix in VIDEOS:
-        raise OutputError(f"{path} is a folder: choose another name for the video")
-    if path.is_file() and path.suffix not in VIDEOS:
+    folder = path.suffix not in WHOLE or path.suffix == ".ros2"
+    if path.is_dir() and not folder:
+        what = "video" if path.suffix in VIDEOS else "file"
+        raise OutputError(f"{path} is a folder: choose another name for the {what}")
+    if path.is_file() and folder:
         raise OutputError(f"{path} is a file: choose another name for the folder of pictures")
     occupied = path.is_file() or (path.is_dir() and any(path.iterdir()))
     if occupied and not overwrite:
@@ -81,13 +91,13 @@ def check_output(path: Path, overwrite: bool) -> None:
     if path.is_dir() and Path.cwd().is_relative_to(path.resolve()):
         raise OutputError(f"{path} is the folder that you are in: choose a folder in it")
     begun = partial_name(path)
-    if path.suffix not in VIDEOS and (strange := _strange(begun)):
+    if folder and (strange := _strange(begun)):
         raise OutputError(
             f"{begun} holds {strange}, which is not of an earlier run: remove it or choose another "
             "output"
         )
     if occupied and path.is_dir():
-        stamped = (path / "timestamps.txt").is_file()
+        stamped = path.suffix == ".ros2" or (path / "timestamps.txt").is_file()
         strange = _strange(path) or (None if stamped else min(path.iterdir()).name)
         if strange:
             raise OutputError(
@@ -104,7 +114,9 @@ def check_output(path: Path, overwrite: bool) -> None:
 
 
 def _strange(folder: Path) -> str | None:
-    """The first of the names in it that no folder of pictures has."""
+    """The first of the names in it that no folder of pictures, or no bag of that name, has."""
+    if folder.suffix == ".ros2":
+        return bag.strange_in(folder) if folder.is_dir() else None
     names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
     return min((name for name in names if not OURS.fullmatch(name)), default=None)
 
@@ -116,15 +128,21 @@ def check_free(path: Path) -> None:
             pass
 
 
+HEADER = "# index time_us events\n"
+
+
 class FolderWriter:
     """Pictures -> `frame_%010d.png` and `timestamps.txt`, which can go on where it stopped.
 
-    timestamps.txt holds one line a picture: the time of its last event in seconds. From the
-    beginning to the end no other run can write into the folder.
+    timestamps.txt holds one line a picture: the time of its last event in seconds; or, for pictures
+    `at_times`, its number, its time in microseconds and the events that it is of, under a line of
+    names. in_nanoseconds: these are named by their time, `%019d.png`, as Kalibr takes them. From
+    the beginning to the end no other run can write into the folder.
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, at_times: bool = False, in_nanoseconds: bool = False):
         self.path, self.partial = path, partial_name(path)
+        self.at_times, self.in_nanoseconds = at_times, in_nanoseconds
         self.count, self.stamps = 0, None
         self.holding = contextlib.ExitStack()
         with writing(path):
@@ -137,28 +155,48 @@ class FolderWriter:
         with writing(self.path):
             self.stamps = (self.partial / "timestamps.txt").open("a+", newline="")
             self.stamps.seek(0)
-            kept = itertools.islice(self.stamps, done)
+            kept = list(itertools.islice(self.stamps, done + self.at_times if done else 0))
             self.stamps.truncate(sum(map(len, kept)))
+            if self.at_times and not kept:
+                self.stamps.write(HEADER)
 
-    def write(self, picture: np.ndarray, time: int) -> None:
+    def _name(self, time: int) -> str:
+        return f"{1000 * time:019d}" if self.in_nanoseconds else f"frame_{self.count:010d}"
+
+    def write(self, picture: np.ndarray, time: int, events: int = 0) -> None:
         if self.stamps is None:
             self.keep(0)
-        name = self.partial / f"frame_{self.count:010d}.png"
+        name = self._name(time)
+        if self.in_nanoseconds and time < 0:
+            raise OutputError(
+                f"{self.path}: a picture at {time} us, before 0, cannot be named by its time: "
+                "leave out --names nanoseconds"
+            )
         with writing(self.path):
-            Image.fromarray(picture).save(name, compress_level=PNG_LEVEL)
+            Image.fromarray(picture).save(self.partial / f"{name}.png", compress_level=PNG_LEVEL)
             seconds, rest = divmod(abs(time), 1_000_000)
-            self.stamps.write(f"{'-' * (time < 0)}{seconds}.{rest:06d}\n")
+            if self.at_times:
+                self.stamps.write(f"{self.count} {time} {events}\n")
+            else:
+                self.stamps.write(f"{'-' * (time < 0)}{seconds}.{rest:06d}\n")
         self.count += 1
 
     def flush(self) -> None:
         with writing(self.path):
             self.stamps.flush()
 
+    def _names(self) -> set[str]:
+        if not self.in_nanoseconds:
+            return {f"frame_{number:010d}" for number in range(self.count)}
+        with (self.partial / "timestamps.txt").open() as stamps:
+            return {self._name(int(line.split()[1])) for line in itertools.islice(stamps, 1, None)}
+
     def finish(self) -> None:
         with writing(self.path):
             self.stamps.close()
-            for extra in self.partial.glob("frame_*.png"):  # of a longer run before this one
-                if int(extra.stem.removeprefix("frame_")) >= self.count:
+            mine = self._names()
+            for extra in self.partial.glob("*.png"):  # of a longer run before this one
+                if extra.stem not in mine:
                     extra.unlink()
             old = None
             if self.path.exists() and any(self.path.iterdir()):
@@ -228,7 +266,7 @@ class VideoWriter:
         played, real = float(self.at * self.tick), (self.last - self.first) / 1e6
         return played / real if played > 0 and real > 0 else None
 
-    def write(self, picture: np.ndarray, time: int = 0) -> None:
+    def write(self, picture: np.ndarray, time: int = 0, events: int = 0) -> None:
         if self.path.suffix == ".mp4":  # chroma at half the size wants even sides
             odd = [(0, side % 2) for side in picture.shape[:2]]
             picture = np.pad(picture, odd + [(0, 0)] * (picture.ndim - 2), mode="edge")
@@ -289,14 +327,20 @@ def _palette_filter(height: int, width: int, tick: Fraction) -> av.filter.Graph:
 
 
 def open_writer(
-    path: Path, fps: float | None = None, speed: float = 1.0
+    path: Path,
+    fps: float | None = None,
+    speed: float = 1.0,
+    at_times: bool = False,
+    in_nanoseconds: bool = False,
 ) -> FolderWriter | VideoWriter:
-    """fps, speed: of a video, as `VideoWriter` takes them.
+    """fps, speed: of a video, as `VideoWriter` takes them; the others of a folder.
 
     Raises OutputError for a rate that the output cannot show, or where another run writes it."""
     if fps is not None:
         check_rate(path, fps)
-    return VideoWriter(path, fps, speed) if path.suffix in VIDEOS else FolderWriter(path)
+    if path.suffix in VIDEOS:
+        return VideoWriter(path, fps, speed)
+    return FolderWriter(path, at_times, in_nanoseconds)
 
 
 def write_video(path: str | Path, pictures: Iterable[np.ndarray], fps: float = 30) -> None:

@@ -1,0 +1,259 @@
+"""What is asked for (a file, a rate, triggers, frames) -> times in a recording's microseconds.
+
+A file of times has one a line, in its first column or the one that a first line of names calls
+time, t or timestamp. Their unit and what they count from are those that are named, by an option,
+behind a number (`33.3ms`) or in the first line (`#timestamp [ns]`); else those for which most of
+them lie within the recording, and a notice says which.
+"""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from firenet_jax.errors import RecordingError, SettingsError, logger
+from firenet_jax.events import LATEST, Events, Recording, counted
+from firenet_jax.instants import Grid, check_rate, grid
+
+UNITS = {"s": 10**6, "ms": 10**3, "us": 1, "ns": Decimal("0.001")}  # microseconds
+WORDS = {
+    "s": "s", "sec": "s", "secs": "s", "second": "s", "seconds": "s",
+    "ms": "ms", "msec": "ms", "millisecond": "ms", "milliseconds": "ms",
+    "us": "us", "µs": "us", "μs": "us", "usec": "us", "microsecond": "us", "microseconds": "us",
+    "ns": "ns", "nsec": "ns", "nanosecond": "ns", "nanoseconds": "ns",
+}  # fmt: skip
+COLUMN = re.compile(r"t|time|timestamps?|stamps?")  # without its unit
+NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-zµμ]*)", re.IGNORECASE)
+SPLIT = re.compile(r"[\s,;]+")
+NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+LARGEST = 1 << 28  # bytes of a file of times
+
+
+@dataclass(frozen=True)
+class Times:
+    """Images at given times, in place of one for each window. Choose at most one way."""
+
+    rate: float | None = None
+    """So many images per second, from the first event on."""
+    from_zero: bool = False
+    """With --rate: on the grid through time 0 of the recording's clock."""
+    at: Path | None = None
+    """At the times in this file, one a line."""
+    unit: Literal["s", "ms", "us", "ns"] | None = None
+    """Of the times in the file, where it does not name it."""
+    since_start: bool | None = None
+    """Times in the file count from the first event (--no-since-start: they are the recording's);
+    without, as they fit."""
+    between_frames: bool = False
+    """At the times of the camera's frames."""
+    triggers: bool = False
+    """At the edges that the recording has of its trigger inputs."""
+    trigger_edges: Literal["rising", "falling", "both"] = "rising"
+    """Which of them."""
+    trigger_input: int | None = None
+    """Only those of this input."""
+
+    def __post_init__(self):
+        ways = [self.rate, self.at, self.between_frames or None, self.triggers or None]
+        if sum(way is not None for way in ways) > 1:
+            raise SettingsError(
+                "images are wanted in one way: choose one of --rate, --at, --between-frames and "
+                "--triggers"
+            )
+        if self.rate is not None:
+            check_rate(self.rate)
+        for name, given, needed, needs in (
+            ("from-zero", self.from_zero, "rate", self.rate),
+            ("unit", self.unit, "at", self.at),
+            ("since-start", self.since_start is not None, "at", self.at),
+            ("trigger-edges", self.trigger_edges != "rising", "triggers", self.triggers),
+            ("trigger-input", self.trigger_input is not None, "triggers", self.triggers),
+        ):
+            if given and not needs:
+                raise SettingsError(f"--{name} says more of --{needed}, which is not asked for")
+
+    @property
+    def wanted(self) -> bool:
+        return bool(self.rate or self.at or self.between_frames or self.triggers)
+
+    def in_words(self) -> str:
+        """ "images at 30 per second" """
+        if self.rate is not None:
+            return f"images at {self.rate:g} per second"
+        what = "the times of its frames" if self.between_frames else "its triggers"
+        return f"images at {f'the times of {self.at.name}' if self.at else what}"
+
+
+def times_of(
+    wanted: Times, recording: Recording, chunks: Iterable[Events]
+) -> np.ndarray | Grid | None:
+    """The times at which images are wanted, in order; None where none are.
+
+    chunks: the recording's events, after filters of time; read up to the first for a rate, to the
+    end for a file whose times have to be told apart. Raises RecordingError for a file of times
+    that cannot be used and for a recording that has no frames or triggers.
+    """
+    if not wanted.wanted:
+        return None
+    if wanted.rate is not None:
+        first = next((int(events.t[0]) for events in chunks if len(events)), None)
+        if first is None:
+            raise RecordingError(f"{recording.path}: no events, or none that the filters let pass")
+        return grid(first, wanted.rate, wanted.from_zero)
+    if wanted.between_frames:
+        if recording.frames is None or not len(recording.frames.times):
+            raise RecordingError(
+                f"{recording.path}: has no frames whose times could be taken: use --rate or --at"
+            )
+        return np.unique(np.asarray(recording.frames.times, np.int64))
+    if wanted.triggers:
+        return _triggers(wanted, recording)
+    return _from_file(wanted, recording, chunks)
+
+
+def _triggers(wanted: Times, recording: Recording) -> np.ndarray:
+    read = getattr(recording, "triggers", None)
+    found = None if read is None else read()
+    if found is None:
+        raise RecordingError(
+            f"{recording.path}: holds no triggers that its reader knows: use --rate or --at"
+        )
+    times, inputs, rising = (np.asarray(column) for column in found)
+    keep = np.ones(len(times), bool)
+    if wanted.trigger_edges != "both":
+        keep &= rising.astype(bool) == (wanted.trigger_edges == "rising")
+    if wanted.trigger_input is not None:
+        keep &= inputs == wanted.trigger_input
+    if not keep.any():
+        there = ", ".join(map(str, np.unique(inputs).tolist()))
+        raise RecordingError(
+            f"{recording.path}: none of its {counted(len(times), 'trigger')} (inputs {there}) is "
+            "asked for: choose --trigger-edges and --trigger-input as they are"
+        )
+    return np.unique(times[keep].astype(np.int64))
+
+
+# ---- A file of times
+
+
+def _from_file(wanted: Times, recording: Recording, chunks: Iterable[Events]) -> np.ndarray:
+    numbers, unit, since_start = read_times(wanted.at)
+    unit = wanted.unit or unit
+    since_start = since_start if wanted.since_start is None else wanted.since_start
+    units = [unit] if unit else ["us", "ns", "s"]
+    if not unit and any("." in number or "e" in number.lower() for number in numbers):
+        units = ["s"]
+    origins = [False, True] if since_start is None else [since_start]
+    first, last = _span(chunks, whole=len(units) * len(origins) > 1)
+    if first is None:
+        raise RecordingError(f"{recording.path}: no events, or none that the filters let pass")
+
+    best = None
+    for name in units:
+        scaled = _scaled(wanted.at, numbers, name)
+        for relative in origins:
+            times = scaled + first if relative else scaled
+            inside = int(((times >= first) & (times <= last)).sum())
+            if best is None or inside > best[0]:
+                best = inside, times, name, relative
+    inside, times, name, relative = best
+    if len(units) * len(origins) > 1:
+        if not inside:
+            raise RecordingError(
+                f"{wanted.at}: none of its {counted(len(times), 'time')} lies within the "
+                f"recording, {first / 1e6:.6f} to {last / 1e6:.6f} s: name the unit with --unit, "
+                "and --since-start if they count from the first event"
+            )
+        logger.warning(
+            "%s: its %s are taken as %s, %s (--unit and --since-start say it otherwise)",
+            wanted.at, counted(len(times), "time"), NAMES[name],
+            "since the first event" if relative else "on the recording's clock",
+        )  # fmt: skip
+    return np.unique(times)
+
+
+def read_times(path: Path) -> tuple[list[str], str | None, bool | None]:
+    """A file -> (its numbers as they are written, their unit, whether they are since the start),
+    None for what it does not say. Raises RecordingError naming the line that has no time."""
+    try:
+        if path.stat().st_size > LARGEST:
+            raise RecordingError(f"{path}: is larger than {LARGEST >> 20} MB: no list of times")
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path}: cannot read this file of times: {error}") from error
+    numbers, unit, since_start, column = [], None, None, 0
+    for number, line in enumerate(lines, 1):
+        line = line.strip()
+        if not line:
+            continue
+        fields = SPLIT.split(line)
+        found = NUMBER.fullmatch(fields[column]) if column < len(fields) else None
+        if not numbers and (line.startswith("#") or found is None):
+            column, unit, since_start = _header(line, column, unit, since_start)
+            continue
+        if line.startswith("#"):
+            continue
+        behind = found[2].lower() if found else None
+        if behind == "" and len(fields) == 2 and fields[1].lower() in WORDS:  # "33.3 ms"
+            behind = fields[1].lower()
+        if found is None or (behind and behind not in WORDS):
+            raise RecordingError(
+                f"{path}, line {number}: expected a time, found {line[:40]!r}: write one a line"
+            )
+        if behind and WORDS[behind] != (unit or WORDS[behind]):
+            raise RecordingError(f"{path}, line {number}: is in {behind}, but before it in {unit}")
+        if behind and numbers and unit is None:
+            raise RecordingError(f"{path}, line {number}: names a unit, but those before do not")
+        unit = WORDS[behind] if behind else unit
+        numbers.append(found[1])
+    if not numbers:
+        raise RecordingError(f"{path}: holds no times: write one a line")
+    return numbers, unit, since_start
+
+
+def _header(line: str, column: int, unit: str | None, since_start: bool | None):
+    """A first line -> (the column of the time, its unit, whether since the start)."""
+    words = line.lstrip("#").strip().lower()
+    if re.search(r"since (the )?(start|first event|beginning)|relative", words):
+        since_start = True
+    elif re.search(r"absolute|unix|epoch", words):
+        since_start = False
+    joined = re.sub(r"\s*[\[(]\s*(\w+)\s*[\])]", r"_\1", words)  # timestamp [ns] -> timestamp_ns
+    for place, name in enumerate(SPLIT.split(joined)):
+        stem, _, behind = name.rpartition("_")
+        if behind in WORDS and COLUMN.fullmatch(stem):
+            return place, WORDS[behind], since_start
+        if COLUMN.fullmatch(name):
+            column = place
+    named = {WORDS[word] for word in re.findall(r"\w+", words) if word in WORDS}
+    return column, named.pop() if len(named) == 1 else unit, since_start
+
+
+def _scaled(path: Path, numbers: list[str], unit: str) -> np.ndarray:
+    """Decimal numbers -> int64 microseconds, to the nearest one; exact."""
+    try:
+        times = [int((Decimal(number) * UNITS[unit]).to_integral_value()) for number in numbers]
+    except (InvalidOperation, OverflowError):
+        times = [LATEST]
+    if max(map(abs, times)) >= 2**62:
+        times = [min(max(time, -LATEST), LATEST) for time in times]
+    return np.array(times, np.int64)
+
+
+def _span(chunks: Iterable[Events], whole: bool) -> tuple[int | None, int]:
+    """Times of the first event and, if asked for, of the last one before any damage."""
+    first, last = None, LATEST
+    try:
+        for events in chunks:
+            first = int(events.t[0]) if first is None else first
+            if not whole:
+                break
+            last = int(events.t[-1])
+    except RecordingError:
+        if first is None:
+            raise
+    return first, last

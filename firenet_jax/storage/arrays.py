@@ -1,0 +1,63 @@
+"""Images -> one HDF5 file, for people who compute: float32 as the network gives them.
+
+    images   (N, H, W) float32, nominally 0 to 1 and not clipped
+    times    (N,) int64, microseconds on the recording's clock
+    events   (N,) int64, how many events the image is of
+
+It is written beside its final name and renamed when it is whole.
+"""
+
+import os
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from firenet_jax.storage.files import lock_file, partial_name, writing
+
+
+class ArraysWriter:
+    """As `video.VideoWriter`, of images (H, W) float32, all of one size."""
+
+    def __init__(self, path: Path):
+        self.path, self.partial, self.count = path, partial_name(path), 0
+        with writing(path):
+            self.held = self.partial.open("ab")
+            lock_file(self.held, path)
+            # HDF5 would take the same lock once more, and find it taken.
+            self.file = h5py.File(self.partial, "w", locking=False)
+
+    def _start(self, height: int, width: int) -> None:
+        self.file.attrs["description"] = "images of events, by firenet_jax"
+        self.file.attrs["time_unit"] = "microseconds"
+        shape = (0, height, width)
+        self.file.create_dataset(
+            "images", shape, "f4", maxshape=(None, height, width), chunks=(1, height, width)
+        )
+        for name in ("times", "events"):
+            self.file.create_dataset(name, (0,), "i8", maxshape=(None,), chunks=(1024,))
+
+    def write(self, image: np.ndarray, time: int, events: int) -> None:
+        with writing(self.path):
+            if self.count == 0:
+                self._start(*image.shape)
+            for name, value in (("images", image), ("times", time), ("events", events)):
+                self.file[name].resize(self.count + 1, axis=0)
+                self.file[name][self.count] = value
+        self.count += 1
+
+    def finish(self) -> None:
+        with writing(self.path):
+            self.file.close()
+            if os.name == "nt":  # an open file cannot be renamed there
+                self.held.close()
+            self.partial.replace(self.path)
+            self.held.close()
+
+    def abandon(self) -> None:
+        """Removes the partial file."""
+        self.file.close()
+        if os.name == "nt":
+            self.held.close()
+        self.partial.unlink(missing_ok=True)
+        self.held.close()

@@ -1,0 +1,147 @@
+"""Pictures -> a bag of sensor_msgs/Image, by rosbags (no ROS needed), for Kalibr and other tools.
+
+    name.bag     ROS 1
+    name.ros2    ROS 2: a folder of metadata.yaml and an SQLite database, as `ros2 bag` has them
+
+Pictures are mono8 or rgb8. A message has the picture's time in its header and as its own, so that
+who reads either finds it; the frame of coordinates is named there too.
+"""
+
+import contextlib
+import importlib
+import os
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from firenet_jax.errors import OutputError, SettingsError
+from firenet_jax.storage.files import lock, locked, partial_name, writing
+
+IMAGE, HEADER, TIME = (
+    "sensor_msgs/msg/Image", "std_msgs/msg/Header", "builtin_interfaces/msg/Time",
+)  # fmt: skip
+TOPIC = re.compile(r"/?[A-Za-z~][\w~]*(/[A-Za-z~][\w~]*)*")  # ROS's names of topics
+OURS = re.compile(r"metadata\.yaml(\.tmp)?|.*\.db3(-journal|-wal|-shm)?")  # in a ROS 2 bag
+
+
+def check_topic(topic: str) -> None:
+    """Raises SettingsError for what is no name of a topic."""
+    if not TOPIC.fullmatch(topic):
+        raise SettingsError(f"topic is {topic!r}, but names are as /cam0/image_raw")
+
+
+class BagWriter:
+    """As `video.VideoWriter`. Raises OutputError where rosbags is not installed, another run
+    writes the bag, or a time is before 0, which ROS cannot say."""
+
+    def __init__(self, path: Path, topic: str, frame_id: str):
+        self.path, self.partial, self.topic, self.frame_id = (
+            path,
+            partial_name(path),
+            topic,
+            frame_id,
+        )
+        self.ros2, self.count, self.bag = path.suffix == ".ros2", 0, None
+        self.holding = contextlib.ExitStack()
+        try:
+            self.library = importlib.import_module(f"rosbags.rosbag{1 + self.ros2}")
+            types = importlib.import_module("rosbags.typesys")
+        except ImportError as error:
+            raise OutputError(
+                f'{path}: writing bags needs rosbags: pip install "firenet-jax[formats]"'
+            ) from error
+        stores = types.Stores
+        self.types = types.get_typestore(stores.ROS2_HUMBLE if self.ros2 else stores.ROS1_NOETIC)
+
+    def _start(self) -> None:
+        """At the first picture: a database serves the thread that opened it and no other."""
+        _remove(self.partial, self.path)  # of a run that was killed
+        choice = {"version": 9} if self.ros2 else {}
+        bag = self.library.Writer(self.partial, **choice)
+        bag.open()
+        self.bag = bag
+        if os.name != "nt":  # no locks there, and folders cannot be opened
+            handle = os.open(self.partial, os.O_RDONLY)
+            self.holding.callback(os.close, handle)
+            lock(handle, self.path)
+        self.connection = bag.add_connection(self.topic, IMAGE, typestore=self.types)
+
+    def write(self, picture: np.ndarray, time: int, events: int = 0) -> None:
+        """picture: (H, W) or (H, W, 3) uint8; time: microseconds."""
+        if not 0 <= time < 2**31 * 1_000_000:
+            raise OutputError(
+                f"{self.path}: a picture is at {time / 1e6:.6f} s, but ROS counts from 0 to "
+                f"{2**31} s: choose another output"
+            )
+        seconds, rest = divmod(time, 1_000_000)
+        make, height, width = self.types.types, *picture.shape[:2]
+        header = {
+            "stamp": make[TIME](sec=seconds, nanosec=1000 * rest), "frame_id": self.frame_id
+        }  # fmt: skip
+        if not self.ros2:
+            header["seq"] = self.count
+        message = make[IMAGE](
+            header=make[HEADER](**header),
+            height=height,
+            width=width,
+            encoding="mono8" if picture.ndim == 2 else "rgb8",
+            is_bigendian=0,
+            step=picture[0].size,
+            data=np.ascontiguousarray(picture).reshape(-1),
+        )
+        serialise = self.types.serialize_cdr if self.ros2 else self.types.serialize_ros1
+        with writing(self.path):
+            if self.bag is None:
+                self._start()
+            self.bag.write(self.connection, 1000 * time, serialise(message, IMAGE))
+        self.count += 1
+
+    def finish(self) -> None:
+        with writing(self.path):
+            self.bag.close()
+            _remove(self.path, self.path)
+            self.partial.rename(self.path)
+            if self.ros2:  # the files in it are named after what it was called while it was made
+                _rename_inside(self.path, self.partial.name)
+            self.holding.close()
+
+    def abandon(self) -> None:
+        """Removes the partial bag."""
+        if self.bag is None:
+            return
+        with contextlib.suppress(Exception):  # whatever a library says of a bag without an end
+            self.bag.close()
+        with contextlib.suppress(OSError):
+            if self.ros2:
+                shutil.rmtree(self.partial)
+            else:
+                self.partial.unlink()
+        self.holding.close()
+
+
+def _remove(place: Path, name: Path) -> None:
+    """A bag that is there; raises OutputError where another run writes it, or it is none."""
+    if not place.exists():
+        return
+    with locked(place, name):
+        if place.is_file():
+            place.unlink()
+            return
+        if strange := strange_in(place):
+            raise OutputError(f"{place} holds {strange}, which is of no bag: choose another output")
+        shutil.rmtree(place)
+
+
+def strange_in(folder: Path) -> str | None:
+    """The first of the names in it that no ROS 2 bag has."""
+    return min((e.name for e in folder.iterdir() if not OURS.fullmatch(e.name)), default=None)
+
+
+def _rename_inside(folder: Path, old: str) -> None:
+    """metadata.yaml names the database, `images.partial.ros2.db3`, as rosbags chose."""
+    metadata = folder / "metadata.yaml"
+    text = metadata.read_text(encoding="utf-8").replace(f"{old}.db3", f"{folder.name}.db3")
+    (folder / f"{old}.db3").rename(folder / f"{folder.name}.db3")
+    metadata.write_text(text, encoding="utf-8")

@@ -1,0 +1,244 @@
+"""Steps against a slow list of what each must hold; images against single steps of the network."""
+
+import jax
+import numpy as np
+import pytest
+from test_tensors import random_events
+
+from firenet_jax import native
+from firenet_jax.events import Events, Recording, RecordingError
+from firenet_jax.instants import Counts, Grid, grid, steps
+from firenet_jax.network import Weights, initial_params, initial_state, step
+from firenet_jax.reconstruction import Committed, Looks, images_at, reconstruct, reconstruct_at
+from firenet_jax.tensors import normalise, pack, voxelise
+from firenet_jax.windows import Windows, cut
+
+HEIGHT, WIDTH = 12, 17
+FIRST = 10**15
+
+
+def recording_of(events, chunk=50):
+    parts = [events.select(slice(i, i + chunk)) for i in range(0, len(events), chunk)]
+    return Recording("memory", "memory", HEIGHT, WIDTH, lambda: iter(parts), len(events))
+
+
+@pytest.fixture
+def recording():
+    """700 events in 50 ms, more and more of them, and some at the same time."""
+    rng = np.random.default_rng(0)
+    events = random_events(rng, 700, HEIGHT, WIDTH)
+    t = FIRST + (events.t - FIRST) ** 2 // 50_000
+    return recording_of(Events(t // 10 * 10, events.x, events.y, events.p))
+
+
+WAYS = [{"events": 90}, {"events": 90, "longest": 4.0}, {"duration": 7.3}]
+
+
+def whole(recording):
+    parts = list(recording.events())
+    return Events(*(np.concatenate([getattr(part, name) for part in parts]) for name in "txyp"))
+
+
+def expected(recording, windows, time):
+    """(times of the events, share) at a time, with all windows at hand."""
+    events = whole(recording)
+    kept = [window.events.t for window in cut(recording, windows)]
+    if windows.duration is None:
+        begins = [t[0] for t in kept]
+    else:
+        begins = [events.t[0] + round(k * windows.duration * 1000) for k in range(len(kept))]
+    number = max(k for k, begin in enumerate(begins) if begin <= time)
+    passed = [t for t in kept[number] if t <= time]
+    if number == 0:
+        return passed, 1.0
+    shares = [len(passed) / windows.events] if windows.events else []
+    if windows.longest or windows.duration:
+        shares.append((time - begins[number]) / 1000 / (windows.longest or windows.duration))
+    share = min(max(shares), 1.0)
+    before = kept[number - 1]
+    return before[int(share * len(before)) :].tolist() + passed, share
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("chunk", [13, 1000])
+def test_steps_hold_what_they_say(recording, way, chunk):
+    windows, events = Windows(**way), whole(recording)
+    recording = recording_of(events, chunk)
+    times = np.arange(events.t[0] - 500, events.t[-1] + 700, 333)
+    counts = Counts()
+    found = list(steps(recording, windows, times, counts=counts))
+    kept = [s.events.t.tolist() for s in found if s.time is None]
+    assert kept == [window.events.t.tolist() for window in cut(recording, windows)]
+    looks = [s for s in found if s.time is not None]
+    inside = times[(times >= events.t[0]) & (times <= events.t[-1])]
+    assert [s.time for s in looks] == inside.tolist()
+    assert (counts.seen, counts.early, counts.late) == (
+        len(inside),
+        2,
+        (times > events.t[-1]).sum(),
+    )
+    for look in looks:
+        held, share = expected(recording, windows, look.time)
+        assert look.events.t.tolist() == held and look.share == pytest.approx(share)
+        assert look.events.t.max() <= look.time  # never the future
+    if windows.events and windows.longest is None:  # a look is as long as a window
+        assert {len(s.events) for s in looks if s.time > kept[1][0]} <= set(range(89, 92))
+
+
+@pytest.mark.parametrize("way", WAYS[:2])
+def test_just_before_a_step_is_kept_and_just_after_the_look_is_that_step(recording, way):
+    windows = Windows(**way)
+    kept = [window.events for window in cut(recording, windows)]
+    ends = [events.t[-1] for events in kept]
+    begins = [events.t[0] for events in kept]
+    found = {s.time: s for s in steps(recording, windows, sorted({*ends, *begins})) if s.time}
+    for number in range(1, len(kept) - 1):
+        if ends[number] < begins[number + 1] and len(kept[number]) == windows.events:
+            assert found[ends[number]].share == 1.0
+            assert found[ends[number]].events.t.tolist() == kept[number].t.tolist()
+        look = found[begins[number]]
+        assert look.share < 0.1 and abs(len(look.events) - len(kept[number - 1])) < 9
+
+
+def test_a_grid_is_rounded_alone_and_coarser_ones_lie_in_it():
+    take = lambda g, n: [next(g) for _ in range(n)]  # noqa: E731
+    assert take(grid(7, 30), 4) == [7, 33340, 66674, 100007]
+    coarse, fine = take(grid(FIRST, 30), 50), take(grid(FIRST, 3000), 5000)
+    assert coarse == fine[::100]
+    assert take(grid(50_000, 30, from_zero=True), 2) == [66667, 100000]
+    assert take(grid(-50_000, 30, from_zero=True), 3) == [-33333, 0, 33333]
+    assert take(grid(0, 0.1), 2) == [0, 10**7]
+    for rate in (0, -1, float("nan"), 2e6):
+        with pytest.raises(ValueError, match="rate is"):
+            grid(0, rate)
+
+
+def test_damage_is_told_after_what_came_before_it(recording):
+    def damaged():
+        yield from recording.events()
+        raise RecordingError("here")
+
+    found = []
+    with pytest.raises(RecordingError, match="here"):
+        for entry in steps(recording, Windows(events=90), Grid(FIRST, 1000), damaged()):
+            found.append(entry)
+    kept = [s for s in found if s.time is None]
+    assert len(kept) == 7 and len([s for s in found if s.time]) > 7
+
+
+@pytest.mark.parametrize("way", [{"between_frames": True}, {"events": 9, "step": 3}])
+def test_windows_that_are_of_no_use_for_it(recording, way):
+    with pytest.raises(ValueError, match="images at given times"):
+        next(steps(recording, Windows(**way), [1]))
+
+
+def test_no_events_and_windows_without_any():
+    assert list(steps(recording_of(Events.empty()), Windows(events=5), [1])) == []
+    t = np.array([0, 1, 9_000], np.int64) + FIRST
+    events = Events.of(t, t * 0, t * 0, t % 2)
+    found = list(steps(recording_of(events), Windows(duration=2), FIRST + np.arange(0, 9001, 1000)))
+    assert len([s for s in found if s.time is None]) == 5
+    assert [len(s.events) for s in found if s.time] == [1, 2, 2, 1, 0, 0, 0, 0, 0, 1]
+
+
+# ---- Images
+
+
+@pytest.fixture(scope="module")
+def weights():
+    return Weights(initial_params(jax.random.key(0)), True)
+
+
+def slowly(weights, recording, windows, times):
+    """Step by step, outside of any scan, by XLA alone."""
+    zero = initial_state(1, HEIGHT, WIDTH)
+    before, last, images = zero, zero, []
+
+    def run(state, events):
+        tensor = normalise(voxelise(pack([[events]]), height=HEIGHT, width=WIDTH)[0])
+        return step(weights.params, state, tensor)
+
+    for entry in steps(recording, windows, times):
+        if entry.time is None:
+            before, (last, _) = last, run(last, entry.events)
+        else:
+            between = [(1 - entry.share) * a + entry.share * b for a, b in zip(before, last)]  # noqa: B905
+            images.append(run(type(last)(*between), entry.events)[1][0])
+    return np.stack(images)
+
+
+@pytest.mark.parametrize("machine_code", [True, False])
+def test_images_are_those_of_single_steps(weights, recording, machine_code, monkeypatch):
+    if not machine_code:
+        monkeypatch.setenv("FIRENET_NATIVE", "0")
+        jax.clear_caches()
+    times = np.arange(FIRST + 3000, FIRST + 45_000, 3501)
+    found = list(images_at(weights, recording, times, chunk=5, events=90))
+    if not machine_code:
+        jax.clear_caches()
+    assert np.concatenate([t for t, _ in found]).tolist() == times.tolist()
+    with native.by_xla_alone():
+        wanted = slowly(weights, recording, Windows(events=90), times)
+    np.testing.assert_allclose(np.concatenate([i for _, i in found]), wanted, atol=2e-6)
+
+
+def test_an_image_does_not_depend_on_the_others_that_are_asked_for(weights, recording):
+    found = {}
+    for rate, chunk in ((200, 8), (2000, 8), (2000, 3)):
+        series = images_at(weights, recording, grid(FIRST, rate), chunk=chunk, events=90)
+        found[rate, chunk] = {t: i for times, images in series for t, i in zip(times, images)}  # noqa: B905
+    for other in ((2000, 8), (2000, 3)):
+        common = found[200, 8].keys() & found[other].keys()
+        assert len(common) == len(found[200, 8]) >= 9
+        for time in common:
+            np.testing.assert_allclose(found[200, 8][time], found[other][time], atol=1e-6)
+
+
+def test_recordings_side_by_side_and_steps_that_are_not_there(weights):
+    """Three recordings of 6, 4 and 0 steps, of which some look, against each alone."""
+    rng = np.random.default_rng(1)
+    tensors = rng.normal(size=(6, 3, HEIGHT, WIDTH, 5)).astype(np.float32)
+    looks, share = rng.random((6, 3)) < 0.5, rng.random((6, 3)).astype(np.float32)
+    lengths = np.array([6, 4, 0])
+    valid = np.arange(6)[:, None] < lengths[None]
+    zero = initial_state(3, HEIGHT, WIDTH)
+    after, images = reconstruct_at(
+        weights, Committed(zero, zero), tensors, Looks(looks, share), valid
+    )
+    for b, length in enumerate(lengths):
+        alone = initial_state(1, HEIGHT, WIDTH)
+        state = Committed(alone, alone)
+        for t in range(length):
+            part = Looks(looks[t : t + 1, b : b + 1], share[t : t + 1, b : b + 1])
+            state, image = reconstruct_at(weights, state, tensors[t : t + 1, b : b + 1], part)
+            np.testing.assert_allclose(images[t, b], image[0, 0], atol=1e-6)
+        for ours, theirs in zip(jax.tree.leaves(after), jax.tree.leaves(state), strict=True):
+            np.testing.assert_allclose(ours[b], theirs[0], atol=1e-6)
+
+
+def test_steps_that_are_all_kept_are_those_of_reconstruct(weights):
+    tensors = np.random.default_rng(2).normal(size=(4, 1, HEIGHT, WIDTH, 5)).astype(np.float32)
+    zero = initial_state(1, HEIGHT, WIDTH)
+    for recurrent in (True, False):
+        state, wanted = reconstruct(weights, zero, tensors, recurrent=recurrent)
+        kept = Looks(np.zeros((4, 1), bool), np.ones((4, 1), np.float32))
+        after, images = reconstruct_at(
+            weights, Committed(zero, zero), tensors, kept, recurrent=recurrent
+        )
+        np.testing.assert_allclose(images, wanted, atol=1e-6)
+        np.testing.assert_allclose(after.last.g2, state.g2, atol=1e-6)
+
+
+def test_nothing_recompiles_as_data_flows(weights, recording):
+    reconstruct_at.clear_cache()
+    voxelise.clear_cache()
+    for rate in (40, 333, 1000):
+        list(images_at(weights, recording, grid(FIRST, rate), chunk=4, events=90, longest=9))
+    assert reconstruct_at._cache_size() == 1 and voxelise._cache_size() <= 2
+
+
+def test_impossible_choices(weights, recording):
+    with pytest.raises(ValueError, match="chunk is 0"):
+        next(images_at(weights, recording, [1], chunk=0))
+    with pytest.raises(ValueError, match="given times"):
+        next(images_at(weights, recording, [1], between_frames=True))

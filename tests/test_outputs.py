@@ -1,0 +1,139 @@
+"""Images and pictures in other files, read back by the libraries of these formats."""
+
+import h5py
+import numpy as np
+import pytest
+
+from firenet_jax.readers import open_recording
+from firenet_jax.storage.arrays import ArraysWriter
+from firenet_jax.storage.bag import BagWriter, check_topic
+from firenet_jax.storage.files import OutputError
+from firenet_jax.storage.video import FolderWriter, check_output
+
+TIMES = [1_700_000_000_000_001 + 33_333 * k for k in range(5)]
+
+
+def pictures(count=5, colours=False, height=6, width=9):
+    rng = np.random.default_rng(0)
+    shape = (count, height, width, 3) if colours else (count, height, width)
+    return rng.integers(0, 256, shape, dtype=np.uint8)
+
+
+def write(writer, images):
+    for number, (image, time) in enumerate(zip(images, TIMES, strict=True)):
+        writer.write(image, time, 100 + number)
+    writer.finish()
+
+
+def test_arrays_hold_images_times_and_events(tmp_path):
+    images = pictures().astype(np.float32) / 200 - 0.1
+    write(ArraysWriter(tmp_path / "images.h5"), images)
+    with h5py.File(tmp_path / "images.h5") as file:
+        assert file["images"].dtype == np.float32 and file["times"].dtype == np.int64
+        np.testing.assert_array_equal(file["images"], images)
+        assert file["times"][:].tolist() == TIMES
+        assert file["events"][:].tolist() == [100, 101, 102, 103, 104]
+    assert [path.name for path in tmp_path.iterdir()] == ["images.h5"]
+
+
+@pytest.mark.parametrize("name", ["images.bag", "images.ros2"])
+@pytest.mark.parametrize("colours", [False, True])
+def test_bags_are_read_back(tmp_path, name, colours):
+    highlevel = pytest.importorskip("rosbags.highlevel")
+    typesys = pytest.importorskip("rosbags.typesys")
+    shown = pictures(colours=colours)
+    write(BagWriter(tmp_path / name, "/cam7/image_raw", "left"), shown)
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    with highlevel.AnyReader([tmp_path / name], default_typestore=store) as bag:
+        (connection,) = bag.connections
+        assert (connection.topic, connection.msgtype) == (
+            "/cam7/image_raw",
+            "sensor_msgs/msg/Image",
+        )
+        messages = list(bag.messages())
+        assert [time for _, time, _ in messages] == [1000 * time for time in TIMES]
+        for (_, time, raw), picture in zip(messages, shown, strict=True):
+            message = bag.deserialize(raw, connection.msgtype)
+            stamp = message.header.stamp
+            assert 10**9 * stamp.sec + stamp.nanosec == time and message.header.frame_id == "left"
+            assert message.encoding == ("rgb8" if colours else "mono8")
+            assert (message.height, message.width, message.step) == (6, 9, picture[0].size)
+            np.testing.assert_array_equal(message.data.reshape(picture.shape), picture)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    if name.endswith("ros2"):
+        inside = {path.name for path in (tmp_path / name).iterdir()}
+        assert inside == {"metadata.yaml", "images.ros2.db3"}
+
+
+@pytest.mark.parametrize("name", ["images.bag", "images.ros2"])
+def test_bags_are_replaced_whole_or_left_out(tmp_path, name):
+    pytest.importorskip("rosbags")
+    for count in (5, 3):
+        writer = BagWriter(tmp_path / name, "/image", "cam0")
+        for picture, time in zip(pictures(count), TIMES, strict=False):
+            writer.write(picture, time)
+        writer.finish()
+    with pytest.raises(OutputError, match="exists"):
+        check_output(tmp_path / name, overwrite=False)
+    check_output(tmp_path / name, overwrite=True)
+    other = BagWriter(tmp_path / f"b.{name}", "/image", "cam0")
+    other.abandon()
+    other = BagWriter(tmp_path / f"b.{name}", "/image", "cam0")
+    other.write(pictures()[0], 7)
+    other.abandon()
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_what_a_bag_cannot_say(tmp_path):
+    pytest.importorskip("rosbags")
+    writer = BagWriter(tmp_path / "a.bag", "/image", "cam0")
+    with pytest.raises(OutputError, match="ROS counts from 0"):
+        writer.write(pictures()[0], -1)
+    for topic in ("", "/", "a b", "/cam0//image", "9a"):
+        with pytest.raises(ValueError, match="topic is"):
+            check_topic(topic)
+    for topic in ("/cam0/image_raw", "image", "~/image"):
+        check_topic(topic)
+
+
+def test_a_folder_of_something_else_is_not_replaced(tmp_path):
+    (tmp_path / "images.ros2").mkdir()
+    (tmp_path / "images.ros2" / "thesis.txt").write_text("of two years")
+    with pytest.raises(OutputError, match=r"thesis\.txt, which this program did not write"):
+        check_output(tmp_path / "images.ros2", overwrite=True)
+    (tmp_path / "a.h5").mkdir()
+    with pytest.raises(OutputError, match="a.h5 is a folder"):
+        check_output(tmp_path / "a.h5", overwrite=True)
+
+
+def test_a_folder_at_times_says_index_time_and_events_and_goes_on(tmp_path):
+    for in_nanoseconds in (False, True):
+        out = tmp_path / f"out{in_nanoseconds}"
+        writer = FolderWriter(out, True, in_nanoseconds)
+        for number in range(4):  # two more than will be kept
+            writer.write(pictures()[number], TIMES[number] + number, 0)
+        writer.abandon()
+        writer = FolderWriter(out, True, in_nanoseconds)
+        writer.keep(2)
+        for number in (2, 3, 4):
+            writer.write(pictures()[number], TIMES[number], number)
+        writer.finish()
+        lines = (out / "timestamps.txt").read_text().splitlines()
+        assert lines[0] == "# index time_us events"
+        assert [line.split() for line in lines[1:]] == [
+            [str(k), str(TIMES[k] + (k if k < 2 else 0)), str(k if k > 1 else 0)] for k in range(5)
+        ]
+        names = sorted(path.stem for path in out.glob("*.png"))
+        if in_nanoseconds:
+            assert names == [f"{1000 * int(line.split()[1]):019d}" for line in lines[1:]]
+        else:
+            assert names == [f"frame_{k:010d}" for k in range(5)]
+        check_output(out, overwrite=True)
+
+
+def test_frames_of_a_written_bag_are_no_recording(tmp_path):
+    """It holds no events: what reads recordings says so."""
+    pytest.importorskip("rosbags")
+    write(BagWriter(tmp_path / "a.bag", "/image", "cam0"), pictures())
+    with pytest.raises(ValueError, match="holds no topic of events"):
+        open_recording(tmp_path / "a.bag")

@@ -1,0 +1,140 @@
+"""Times that are asked for, against what their files say in other words."""
+
+import logging
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_windows import recording_of
+
+from firenet_jax.commands.times import Times, times_of
+from firenet_jax.events import RecordingError
+from firenet_jax.instants import Grid
+
+T = 5_000_000 + np.arange(0, 2_000_000, 1000)  # 5 to 7 s on the sensor's clock
+WANTED = [5_250_000, 5_500_000, 6_000_001]  # microseconds
+
+
+@pytest.fixture
+def recording():
+    return recording_of(T, frames=[4_990_000, 5_030_000, 5_030_000, 5_070_000])
+
+
+def read(tmp_path, recording, text, **choices):
+    (tmp_path / "times.txt").write_text(text, encoding="utf-8")
+    return times_of(Times(at=tmp_path / "times.txt", **choices), recording, recording.events())
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "5.25\n5.5\n6.000001\n",
+        "5250000\n5500000\n6000001\n",
+        "5250000000\n5500000000\n6000001000\n",
+        "250000\n500000\n1000001\n",
+        ".25\n.5\n1.000001\n",
+        "250000000\n500000000\n1000001000\n",
+        "5250ms\n5500 ms\n6000.001 ms\n",
+        "6000001us\n5250000us\n5500000us\n",
+        "# since the start, in seconds\n\n0.25\n0.5\n1.000001\n",
+        "#timestamp [ns],filename\n5250000000,a.png\n5500000000,b.png\n6000001000,c.png\n",
+        "index,time_us,events\n0,5250000,7\n1,5500000,8\n2,6000001,9\n",
+        "# index time_us events\n0 5250000 7\n1 5500000 8\n2 6000001 9\n",
+        "5.25 images/a.png\n5.5 images/b.png\n6.000001 images/c.png\n",
+        "\ufefft\n5.25e6\n5.5e6\n6.000001e6\n",
+    ],
+)
+def test_the_same_times_in_other_words(tmp_path, recording, text):
+    choices = {"unit": "us"} if "e6" in text else {}
+    found = read(tmp_path, recording, text, **choices)
+    assert found.tolist() == WANTED and found.dtype == np.int64
+
+
+def test_what_was_told_apart_is_said_and_options_decide(tmp_path, recording, caplog):
+    with caplog.at_level(logging.WARNING):
+        read(tmp_path, recording, "0\n1000000\n")
+    assert "2 times are taken as microseconds, since the first event" in caplog.text
+    caplog.clear()
+    found = read(tmp_path, recording, "0\n1000\n", unit="ns", since_start=True)
+    assert found.tolist() == [5_000_000, 5_000_001] and not caplog.text
+    found = read(tmp_path, recording, "5\n6\n", unit="s", since_start=False)
+    assert found.tolist() == [5_000_000, 6_000_000]
+
+
+def test_times_of_today_keep_their_microseconds(tmp_path):
+    first = 1_764_000_000_000_000
+    recording = recording_of(first + np.arange(1000))
+    assert read(tmp_path, recording, "1764000000.000123\n").tolist() == [first + 123]
+    assert read(tmp_path, recording, "1764000000000123456\n").tolist() == [first + 123]
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("", "holds no times"),
+        ("# time\n\n", "holds no times"),
+        ("5.25\nsoon\n", "line 2: expected a time, found 'soon'"),
+        ("5.25s\n5500ms\n", "line 2: is in ms, but before it in s"),
+        ("5.25\n5500ms\n", "line 2: names a unit, but those before do not"),
+        ("5 parsec\n5parsec\n", "holds no times|expected a time"),
+        ("99.5\n", "none of its 1 time lies within the recording, 5.000000 to 6.999000 s"),
+        ("9" * 400 + "\n", "none of its"),
+        ("nan\n", "holds no times"),
+    ],
+)
+def test_files_that_are_of_no_use(tmp_path, recording, text, said):
+    with pytest.raises(RecordingError, match=said):
+        read(tmp_path, recording, text)
+
+
+def test_a_file_that_is_not_there(tmp_path, recording):
+    with pytest.raises(RecordingError, match="cannot read this file of times"):
+        times_of(Times(at=tmp_path / "none.txt"), recording, recording.events())
+
+
+def test_rate_frames_and_nothing(recording):
+    found = times_of(Times(rate=30), recording, recording.events())
+    assert isinstance(found, Grid) and next(found) == 5_000_000
+    found = times_of(Times(rate=30, from_zero=True), recording, recording.events())
+    assert next(found) == 5_000_000 and next(found) == 5_033_333
+    frames = times_of(Times(between_frames=True), recording, recording.events())
+    assert frames.tolist() == [4_990_000, 5_030_000, 5_070_000]
+    assert times_of(Times(), recording, recording.events()) is None
+    with pytest.raises(RecordingError, match="has no frames"):
+        times_of(Times(between_frames=True), recording_of(T), iter([]))
+    with pytest.raises(RecordingError, match="no events"):
+        times_of(Times(rate=30), recording_of([]), iter([]))
+
+
+def test_triggers(recording):
+    columns = np.array([10, 30, 20, 40]), np.array([0, 0, 1, 0]), np.array([1, 0, 1, 1], bool)
+    kept = {field: getattr(recording, field) for field in ("path", "frames", "events")}
+    with_triggers = SimpleNamespace(**kept, triggers=lambda: columns)
+
+    def times(**choices):
+        return times_of(Times(triggers=True, **choices), with_triggers, iter([])).tolist()
+
+    assert times() == [10, 20, 40]
+    assert times(trigger_edges="falling") == [30]
+    assert times(trigger_edges="both", trigger_input=0) == [10, 30, 40]
+    with pytest.raises(RecordingError, match=r"none of its 4 triggers \(inputs 0, 1\)"):
+        times(trigger_input=3)
+    for without in (recording, SimpleNamespace(**kept, triggers=lambda: None)):
+        with pytest.raises(RecordingError, match="holds no triggers"):
+            times_of(Times(triggers=True), without, iter([]))
+
+
+@pytest.mark.parametrize(
+    "choice, said",
+    [
+        ({"rate": 30.0, "triggers": True}, "choose one of"),
+        ({"rate": 0.0}, "rate is 0"),
+        ({"from_zero": True}, "--from-zero says more of --rate"),
+        ({"unit": "s"}, "--unit says more of --at"),
+        ({"trigger_input": 0}, "--trigger-input says more of --triggers"),
+    ],
+)
+def test_impossible_choices(choice, said):
+    with pytest.raises(ValueError, match=said):
+        replace(Times(), **choice)
