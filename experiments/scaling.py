@@ -219,7 +219,7 @@ def main():
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--quick", action="store_true", help="the low ends alone, save nothing")
     options = parser.parse_args()
-    few = 3 if options.quick else None
+    few = 2 if options.quick else None
     runs = 2 if options.quick else options.runs
     lines = {name: line(name, changes[:few], runs) for name, changes in LINES.items()}
     limits = real_time(RESOLUTIONS[: 1 if options.quick else None], runs)

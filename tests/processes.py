@@ -23,7 +23,7 @@ def finish(*processes):
     """Waits for them; fails with what one that failed has said."""
     try:
         for process in processes:
-            _, errors = process.communicate(timeout=300)
+            _, errors = process.communicate(timeout=900)
             assert process.returncode == 0, f"exit {process.returncode}: {errors[-2000:]}"
     finally:  # one that failed leaves the others waiting
         for process in processes:

@@ -472,6 +472,7 @@ print(json.dumps(counts))
 
 
 @EACH_WAY
+@pytest.mark.slow
 def test_nothing_recompiles_while_200_windows_of_200_sizes_stream(tmp_path, weights):
     """In a fresh process; a grid of 5 ms windows that hold 1, 4, 9, ... 40,000 events."""
     sizes = np.arange(1, 201) * np.arange(1, 201)
