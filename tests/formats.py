@@ -175,8 +175,8 @@ def event_packet(time: int, payload: bytes, encoding: str, base=0, size=(240, 32
     out = bytearray(struct.pack("<II", time // 10**6, time % 10**6 * 1000))
 
     def text(value: str):
-        out.extend(bytes(-len(out) % 4) + struct.pack("<I", len(value) + 1))
-        out.extend(value.encode() + b"\0")
+        data = value.encode() + b"\0"
+        out.extend(bytes(-len(out) % 4) + struct.pack("<I", len(data)) + data)
 
     text("camera")
     out += bytes(-len(out) % 4) + struct.pack("<II", *size)

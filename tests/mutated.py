@@ -11,6 +11,7 @@ message is one line; anything else is a fault of ours: another exception, a proc
 
 import argparse
 import collections
+import contextlib
 import json
 import logging
 import os
@@ -292,6 +293,9 @@ def work(seed: int, first: int, count: int, only: str = "") -> None:
         if only:
             words = only.split(",")
             whole = {name: path for name, path in whole.items() if any(w in name for w in words)}
+        for name, path in whole.items():  # loads libraries, which takes its time on a busy machine
+            with contextlib.suppress(Exception):
+                read(name, path)
         resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
         for number in range(first, first + count):
             print(json.dumps([number, "begins", ""]), flush=True)

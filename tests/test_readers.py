@@ -1235,6 +1235,14 @@ def test_mcap_in_parts_and_without_a_storage_plugin(tmp_path, named):
         refused(tmp_path / "bag", "cannot be read", size=None)
 
 
+def test_a_damaged_encoding_is_said_in_one_line(tmp_path):
+    pytest.importorskip("rosbags")
+    chunks = [[(1, formats.event_packet(EPOCH, payload(0), "ev\x1e\u20283"))]]
+    with pytest.raises(RecordingError, match="encoded as ev\\?\\?3") as error:
+        events_of(write(tmp_path / "a.mcap", formats.mcap(chunks)), None)
+    assert len(str(error.value).splitlines()) == 1
+
+
 @pytest.mark.parametrize("storage", ["", "other"])
 def test_whole_mcap_without_a_storage_plugin(tmp_path, storage):
     rosbag2 = pytest.importorskip("rosbags.rosbag2")

@@ -381,7 +381,7 @@ def run(settings: Simulate) -> list[Path]:
 
 def _wait_for(path: Path) -> None:
     """The first of several processes begins the folder. Raises OutputError if it does not."""
-    for _ in range(10 * PATIENCE):
+    for _ in range(1 + 10 * PATIENCE):
         if path.is_file():
             return
         sleep(0.1)

@@ -141,11 +141,16 @@ def _only(path: Path, found: list[str], topics: dict[str, str]) -> str:
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
         raise RecordingError(
             f"{path}: holds no topic of events ({', '.join((*ARRAYS, *PACKETS))}), but "
-            f"{listed or 'nothing'}"
+            f"{_in_a_line(listed) or 'nothing'}"
         )
     if len(found) > 1:
         logger.warning("%s: topics %s hold events; reading %s", path, ", ".join(found), found[0])
     return found[0]
+
+
+def _in_a_line(text: str) -> str:
+    """What damage makes of a name may break lines."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def _raw(bag, topic: str, start: int | None = None) -> Iterator[tuple[int, bytes]]:
@@ -251,7 +256,7 @@ def _packet_columns(path: Path, messages: Iterator[_Message]) -> Iterator[tuple[
         return
     if first.encoding not in DECODERS:
         raise RecordingError(
-            f"{path}: its events are encoded as {first.encoding}, expected "
+            f"{path}: its events are encoded as {_in_a_line(first.encoding)}, expected "
             f"{' or '.join(DECODERS)}: convert the bag to one of them"
         )
     shift = None
@@ -397,7 +402,7 @@ def _picture(path: Path, message: _Message) -> np.ndarray:
     encoding, is_big, step = message.text(), message.number(1), message.number(4)
     if encoding not in CHANNELS:
         raise RecordingError(
-            f"{path}: a frame is {encoding}, expected one of {', '.join(CHANNELS)}"
+            f"{path}: a frame is {_in_a_line(encoding)}, expected one of {', '.join(CHANNELS)}"
         )
     kind = np.dtype((">" if is_big else "<") + ("u2" if "16" in encoding else "u1"))
     rows = np.frombuffer(message.bytes(), np.uint8).reshape(height, step)
