@@ -122,12 +122,12 @@ assert not [name for name in sys.modules if name.startswith(("firenet_jax", "fla
 def test_stablehlo_runs_where_the_package_is_not_imported(tmp_path):
     pytest.importorskip("flatbuffers")
     weights = load_weights()
-    tensors = {str(n): sparse_tensors(20, *size) for n, size in enumerate(SIZES)}
+    tensors = {str(n): sparse_tensors(20, *size) for n, size in enumerate(SIZES[1:])}
     (tmp_path / "model.stablehlo").write_bytes(stablehlo(weights, picture=True))
     np.savez(tmp_path / "in.npz", **tensors)
     names = [str(tmp_path / name) for name in ("model.stablehlo", "in.npz", "out.npz")]
     done = subprocess.run(
-        [sys.executable, "-c", ELSEWHERE, *names], capture_output=True, text=True, timeout=280
+        [sys.executable, "-c", ELSEWHERE, *names], capture_output=True, text=True, timeout=900
     )
     assert done.returncode == 0, done.stderr[-2000:]
     found = np.load(tmp_path / "out.npz")

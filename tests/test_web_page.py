@@ -5,6 +5,7 @@ import http.server
 import json
 import os
 import shutil
+import signal
 import subprocess
 import threading
 import zipfile
@@ -79,11 +80,12 @@ def in_browser(folder: Path, browser: str) -> dict[str, bytes]:
         # A port for debugging keeps the headless shell open after the page has loaded.
         options = ["--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0"]
         command = [browser, *options, f"--user-data-dir={folder}/profile", url]
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        process = subprocess.Popen(command, start_new_session=True, **silent)
         try:
-            assert done.wait(240), f"the page sent {list(posted)} and no more"
+            assert done.wait(600), f"the page sent {list(posted)} and no more"
         finally:
-            process.kill()
+            os.killpg(process.pid, signal.SIGKILL)  # it has children
             process.wait()
             server.shutdown()
     return posted

@@ -22,20 +22,26 @@ async function open(file, provider) {
   const session = await ort.InferenceSession.create(new URL("./firenet.onnx", import.meta.url).href, {
     executionProviders: [provider],
   });
+  const zeros = (channels) => tensor(ort, new Float32Array(channels * 64), channels, 8, 8);
+  // What a GPU cannot compute shows only when it runs.
+  await session.run({ events: zeros(BINS), g1: zeros(CHANNELS), g2: zeros(CHANNELS) });
   return { ort, session, provider };
 }
+
+const tensor = (ort, data, channels, height, width) =>
+  new ort.Tensor("float32", data, [1, channels, height, width]);
 
 /** Events and windows -> {picture Uint8Array (height, width), tensor, time} one after the other. */
 export async function* reconstruct({ ort, session }, events, windows) {
   const { width, height, t } = events;
   const zeros = () =>
-    new ort.Tensor("float32", new Float32Array(CHANNELS * height * width), [1, CHANNELS, height, width]);
+    tensor(ort, new Float32Array(CHANNELS * height * width), CHANNELS, height, width);
   let [g1, g2] = [zeros(), zeros()];
   for (const window of windows) {
-    const tensor = voxels(events, window);
-    const input = new ort.Tensor("float32", tensor, [1, BINS, height, width]);
+    const votes = voxels(events, window);
+    const input = tensor(ort, votes, BINS, height, width);
     const found = await session.run({ events: input, g1, g2 }, ["picture", "g1_next", "g2_next"]);
     [g1, g2] = [found.g1_next, found.g2_next];
-    yield { picture: found.picture.data, tensor, time: t[window[1] - 1] };
+    yield { picture: found.picture.data, tensor: votes, time: t[window[1] - 1] };
   }
 }
