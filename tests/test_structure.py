@@ -93,8 +93,10 @@ def test_computing_never_imports_presenting():
 LINES, PARAMETERS = 60, 7
 LARGER = {  # function: why
     "commands.reconstruct.reconstruct_jobs": "three threads share its slots",
+    "commands.reconstruct.run": "what is checked before the first recording is read",
     "readers.open_recording": "its docstring is what users read",
     "readers.arrays.recording": "one option a fact that no file says",
+    "reconstruction.reconstruct_at": "what `reconstruct` takes, and the instants",
     "reconstruction.events_to_pictures": "one compiled program: what it is made for are options",
     "simulation.scenes.random_scene": "random numbers are handed out in one order, read as a list",
     "simulation.sensor.random_setups": "one option a choice, all with defaults",

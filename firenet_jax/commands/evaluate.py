@@ -458,6 +458,8 @@ def open_folder(
         if not (path.is_file() and path.with_suffix(".npz").is_file()):
             continue
         saved = read_record(path, "remove it")
+        if saved is None:
+            continue
         try:
             was, result = {**saved["record"]}, Measured(**saved["result"])
         except (KeyError, TypeError) as error:

@@ -151,7 +151,8 @@ class Train:
         """What a step of the training depends on, apart from its data."""
         names = {field.name for field in dataclasses.fields(StepSettings)}
         chosen: dict[str, Any] = {name: getattr(self, name) for name in names}
-        return StepSettings(**chosen | {"warmup": warming_up(self)})
+        chosen["warmup"] = warming_up(self)
+        return StepSettings(**chosen)
 
 
 def warming_up(settings: Train) -> int:
