@@ -256,3 +256,28 @@ def test_colours_of_a_sensor_that_says_it_is_grey(here, capsys):
     (here / "a.dat").write_bytes(b"% Version 2\n% Width 24\n% Height 20\n\x00\x08" + words)
     code, _, error = firenet(capsys, "reconstruct a.dat -o out -c weights.npz --color")
     assert code == 1 and "sees no colours" in error and not list(here.glob("out*"))
+
+
+KEEPS = """
+import resource, threading
+from firenet_jax import cli
+cli._keep_freed_memory()
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    b"1" * 100_000_000
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+found = []
+thread = threading.Thread(target=lambda: found.extend(faults() for _ in range(3)))
+thread.start()
+thread.join()
+assert found[0] > 1000 > found[2], found
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
+def test_training_keeps_its_memory():
+    """In a thread, as XLA's."""
+    environment = {k: v for k, v in os.environ.items() if k != "GLIBC_TUNABLES"}
+    subprocess.run([sys.executable, "-c", KEEPS], env=environment, check=True)
