@@ -83,11 +83,11 @@ def _gru_forward(machine_code, h, x, gates, candidate):
             *(h, update, x, left, *candidate),
         )
     )
-    return state, (h, x, gates[0], candidate[0], reset, update, left, q)
+    return state, (h, x, gates[0], candidate[0], reset, update, q)
 
 
 def _gru_backward(machine_code, kept, by_state):
-    h, x, gates, candidate, reset, update, left, q = kept
+    h, x, gates, candidate, reset, update, q = kept
 
     def through_candidate_by_machine_code(change, kernel, *operands):
         both = ("none", "none")
@@ -110,6 +110,7 @@ def _gru_backward(machine_code, kept, by_state):
         return by_x + more_x, by_h + more_h
 
     change = by_state * update * (1 - q * q)
+    left = reset * h  # quicker than to keep it
     by_candidate = parameter_gradients(machine_code, (x, left), candidate, (change,))
     by_x, by_reset, by_update, by_h = choose(
         machine_code,

@@ -104,6 +104,21 @@ REPORT = (
     "firenet: this is a fault of firenet, not of yours: please report it, with the command and all "
     "these lines"
 )
+
+
+def _keep_freed_memory() -> None:
+    """Tells glibc to keep memory for the same again, as a training step asks for it.
+
+    Else each step gets some hundred MB anew from the system, which takes a fifth of its time.
+    """
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):
+            tell = ctypes.CDLL(None).mallopt
+            tell(-8, 1)  # M_ARENA_MAX: those of threads keep no large blocks
+            tell(-4, 0)  # M_MMAP_MAX
+            tell(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
+
+
 HUGE_PAGES = "glibc.malloc.hugetlb=1"
 
 
@@ -161,8 +176,8 @@ def main(arguments: list[str] | None = None) -> int:
     from firenet_jax.commands import options
 
     logging.basicConfig(format="firenet: %(message)s", level=logging.WARNING)
-    _return_freed_memory()
     name, rest = arguments[0], arguments[1:]
+    _keep_freed_memory() if name == "train" else _return_freed_memory()
     module, settings, _ = COMMANDS[name]
     for option in (word.partition("=")[0] for word in rest):
         if name == "reconstruct" and option in FORMER:

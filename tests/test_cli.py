@@ -353,3 +353,28 @@ def test_what_may_not_be_read_is_named(here, capsys, monkeypatch):
         info, "run", Mock(side_effect=PermissionError(13, "Permission denied", "x"))
     )
     assert "error: x: permission denied: give" in firenet(capsys, "info a.txt")[2]
+
+
+KEEPS = """
+import resource, threading
+from firenet_jax import cli
+cli._keep_freed_memory()
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    b"1" * 100_000_000
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+found = []
+thread = threading.Thread(target=lambda: found.extend(faults() for _ in range(3)))
+thread.start()
+thread.join()
+assert found[0] > 1000 > found[2], found
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
+def test_training_keeps_its_memory():
+    """In a thread, as XLA's."""
+    environment = {k: v for k, v in os.environ.items() if k != "GLIBC_TUNABLES"}
+    subprocess.run([sys.executable, "-c", KEEPS], env=environment, check=True)

@@ -170,8 +170,6 @@ def test_differentiated_and_computed_again():
 # ---- Other processes
 
 EQUAL = """
-import sys
-sys.path.insert(0, "tests")
 import jax, numpy as np
 
 def check(seed):
@@ -212,8 +210,8 @@ trial.assert_equal(found, trial.steps(False)(weights, state, tensors, valid))
 
 
 def run_alone(script, **environment):
-    path = os.pathsep.join([os.getcwd(), *filter(None, [os.environ.get("PYTHONPATH")])])
-    environment = os.environ | {"PYTHONPATH": path} | environment
+    path = [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, path))} | environment
     subprocess.run([sys.executable, "-c", EQUAL + script], env=environment, check=True)
 
 
