@@ -29,6 +29,7 @@ SMALL = {
     "figure5_recurrence": "--seconds 0.2",
     "figure6_limitations": "--seconds 0.2 --sequences 1",
     "file_to_pictures": "--events 60000 --runs 1",
+    "instants": "{recording}",
     "memory": "--hdf5 200000 --text 200000 --runs 1",
     "readme_picture": f"{WEIGHTS} {{recording}}",
     "scaling": "--quick",
