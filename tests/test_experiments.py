@@ -31,6 +31,7 @@ SMALL = {
     "figure5_recurrence": "--seconds 0.2",
     "figure6_limitations": "--seconds 0.2 --sequences 1",
     "file_to_pictures": "--events 60000 --runs 1",
+    "instants": "{recording}",
     "memory": "--hdf5 20000 --text 20000 --runs 1",
     "onnxruntime_step": "--sizes 48x32 --windows 2 --runs 1",
     "readme_video": f"{WEIGHTS} {{recording}}",

@@ -126,6 +126,9 @@ def test_a_folder_at_times_says_index_time_and_events_and_goes_on(tmp_path):
         names = sorted(path.stem for path in out.glob("*.png"))
         if in_nanoseconds:
             assert names == [f"{1000 * int(line.split()[1]):019d}" for line in lines[1:]]
+            # as Kalibr's and e2calib's makers of bags read them
+            stamps = [10**9 * int(name[:-9]) + int(name[-9:]) for name in names]
+            assert stamps == [1000 * int(line.split()[1]) for line in lines[1:]]
         else:
             assert names == [f"frame_{k:010d}" for k in range(5)]
         check_output(out, overwrite=True)

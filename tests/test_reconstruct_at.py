@@ -111,7 +111,7 @@ def test_a_video_keeps_the_times(tmp_path, weights):  # noqa: F811
     recording = write_recording(tmp_path / "a.txt", 800)
     wanted = [0.1, 0.101, 0.35, 0.5004, 0.9]
     (tmp_path / "times.txt").write_text("".join(f"{time}s\n" for time in wanted))
-    at = Times(at=tmp_path / "times.txt", since_start=False)
+    at = Times(at=tmp_path / "times.txt", since="zero")
     run(settings(weights, (recording,), tmp_path / "a.mp4", times=at, speed=0.1))
     with av.open(str(tmp_path / "a.mp4")) as container:
         found = [frame.time for frame in container.decode(video=0)]
@@ -122,7 +122,7 @@ def test_times_outside_of_a_recording(tmp_path, weights, caplog):  # noqa: F811
     recording = write_recording(tmp_path / "a.txt", 500)
     for text, name in (("-5s\n0.5s\n7s\n8s\n", "some"), ("7s\n", "none")):
         (tmp_path / name).write_text(text)
-    some, none = (Times(at=tmp_path / n, since_start=False) for n in ("some", "none"))
+    some, none = (Times(at=tmp_path / n, since="zero") for n in ("some", "none"))
     run(settings(weights, (recording,), tmp_path / "out", times=some))
     assert "times without an image: 1 before its first event, 2 after its last one" in caplog.text
     assert stamps_of(tmp_path / "out")[:, 1].tolist() == [500_000]

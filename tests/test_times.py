@@ -56,9 +56,9 @@ def test_what_was_told_apart_is_said_and_options_decide(tmp_path, recording, cap
         read(tmp_path, recording, "0\n1000000\n")
     assert "2 times are taken as microseconds, since the first event" in caplog.text
     caplog.clear()
-    found = read(tmp_path, recording, "0\n1000\n", unit="ns", since_start=True)
+    found = read(tmp_path, recording, "0\n1000\n", unit="ns", since="start")
     assert found.tolist() == [5_000_000, 5_000_001] and not caplog.text
-    found = read(tmp_path, recording, "5\n6\n", unit="s", since_start=False)
+    found = read(tmp_path, recording, "5\n6\n", unit="s", since="zero")
     assert found.tolist() == [5_000_000, 6_000_000]
 
 

@@ -45,9 +45,9 @@ class Times:
     """At the times in this file, one a line."""
     unit: Literal["s", "ms", "us", "ns"] | None = None
     """Of the times in the file, where it does not name it."""
-    since_start: bool | None = None
-    """Times in the file count from the first event (--no-since-start: they are the recording's);
-    without, as they fit."""
+    since: Literal["start", "zero"] | None = None
+    """Times in the file count from the first event (start), or are those of the recording's own
+    clock (zero). Without: as they fit."""
     between_frames: bool = False
     """At the times of the camera's frames."""
     triggers: bool = False
@@ -69,7 +69,7 @@ class Times:
         for name, given, needed, needs in (
             ("from-zero", self.from_zero, "rate", self.rate),
             ("unit", self.unit, "at", self.at),
-            ("since-start", self.since_start is not None, "at", self.at),
+            ("since", self.since, "at", self.at),
             ("trigger-edges", self.trigger_edges != "rising", "triggers", self.triggers),
             ("trigger-input", self.trigger_input is not None, "triggers", self.triggers),
         ):
@@ -143,7 +143,7 @@ def _triggers(wanted: Times, recording: Recording) -> np.ndarray:
 def _from_file(wanted: Times, recording: Recording, chunks: Iterable[Events]) -> np.ndarray:
     numbers, unit, since_start = read_times(wanted.at)
     unit = wanted.unit or unit
-    since_start = since_start if wanted.since_start is None else wanted.since_start
+    since_start = since_start if wanted.since is None else wanted.since == "start"
     units = [unit] if unit else ["us", "ns", "s"]
     if not unit and any("." in number or "e" in number.lower() for number in numbers):
         units = ["s"]
@@ -166,10 +166,10 @@ def _from_file(wanted: Times, recording: Recording, chunks: Iterable[Events]) ->
             raise RecordingError(
                 f"{wanted.at}: none of its {counted(len(times), 'time')} lies within the "
                 f"recording, {first / 1e6:.6f} to {last / 1e6:.6f} s: name the unit with --unit, "
-                "and --since-start if they count from the first event"
+                "and with --since start that they count from the first event"
             )
         logger.warning(
-            "%s: its %s are taken as %s, %s (--unit and --since-start say it otherwise)",
+            "%s: its %s are taken as %s, %s (--unit and --since say it otherwise)",
             wanted.at, counted(len(times), "time"), NAMES[name],
             "since the first event" if relative else "on the recording's clock",
         )  # fmt: skip
