@@ -11,8 +11,8 @@ mostly clean sensors again; then a loss that sees faint structure and flicker; t
 blank grounds, uneven thresholds and what passes within one window, to teach it to forget what has
 passed; then the usual motion and faults again; then other pictures, most of them photographs of
 everyday things; rare motion, much slower and much faster, and noise that alternates as that of real
-sensors does; then detail where next to nothing moves; at last sequences of hundreds of windows.
-Each was a lesson of the one before.
+sensors does; then detail where next to nothing moves; then sequences of hundreds of
+windows; at last windows of any density, and noise alone. Each was a lesson of the one before.
 
 PICTURES were 63: scikit-image's own (`textures.PHOTOGRAPHS`), matplotlib's sample data, and those
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
@@ -29,8 +29,9 @@ paper-kit-2, shards-ui, smartcrop, soft-ui-dashboard, soft-ui-design-system, sta
 -business-casual, -clean-blog, -coming-soon, -creative, -landing-page, -one-page-wonder and
 -stylish-portfolio, stisla, tabler-ui, @tabler/preview, tracking, uikit and @vladmandic/face-api.
 "still" and "detail" had 927, collected anew from these packages: those of at least 280 pixels on a
-side that are no plain drawings, each once, without opencv-doc's chessboards. "ages" and "aged" had
-340: those of the Debian packages opencv-doc, stellarium-data, lomiri-wallpapers-16.04 and -20.04,
+side that are no plain drawings, each once, without opencv-doc's chessboards. Those from "ages" on
+had 340: those of the Debian packages opencv-doc, stellarium-data, lomiri-wallpapers-16.04 and
+-20.04,
 hugin-data, mate-backgrounds, cimg-doc, plasma-workspace-wallpapers, palapeli-data and
 tuxpaint-stamps-default, of npm's @tabler/preview, material-kit, paper-kit-2, now-ui-kit,
 startbootstrap-creative and stisla, of scikit-image, mahotas and imgaug. No picture of
@@ -330,6 +331,32 @@ AGED = replace(
     loss=replace(AGES.loss, l1=1.0),
     scene=replace(AGES.scene, halt=0.3),
 )
+# More noise, in which images had still sunk to dark after a hundred windows of nothing else; and
+# more weight on what local equalisation shows, and on flicker, in which clean sensors were behind.
+NOISY = replace(
+    AGED,
+    steps=1800,
+    warmup=20,
+    learning_rate=8e-4,
+    swift=0.05,
+    seed=131,
+    loss=replace(AGED.loss, contrast=1.5, equalised=1.0, equalised_mse=12.0, lambda_tc=3.0),
+    scene=replace(AGED.scene, plain=0.25),
+    sensor=replace(AGED.sensor, noise=(1e-3, 12.0)),
+)
+# Dense windows, up to some three events per pixel, which had washed out: up to 24 pixels pass in
+# one. ON and OFF may differ more, as they do in the paper's sensor.
+DENSE = replace(
+    NOISY,
+    steps=1250,
+    renderings=24,
+    motion=(0.3, 24.0),
+    swift=0.03,
+    seed=141,
+    loss=replace(NOISY.loss, equalised=1.2),
+    scene=replace(AGED.scene, plain=0.2),
+    sensor=replace(AGED.sensor, noise=(1e-3, 10.0), mismatch=0.02, asymmetry=0.18),
+)
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
@@ -351,6 +378,8 @@ STAGES = {
     "detail": (DETAIL, None),
     "ages": (AGES, 500),
     "aged": (AGED, None),
+    "noisy": (NOISY, 250),
+    "dense": (DENSE, None),
 }
 # Parts of a mean: what a stage starts from, if not from the one before.
 FIRST = {"even": 1, "usual": 1, "settle": 1, "natural": 9}
