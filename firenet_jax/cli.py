@@ -189,7 +189,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         command = importlib.import_module(module)
         kind = getattr(command, settings)
-        command.run(options.parse(kind, rest, f"firenet {name}", inspect.getdoc(kind)))
+        command.run(options.parse(kind, rest, f"firenet {name}", inspect.getdoc(kind) or ""))
     except KeyboardInterrupt as error:
         goes_on = str(error) or "a folder of pictures or sequences goes on when run again"
         print(f"firenet: interrupted; {goes_on}", file=sys.stderr)

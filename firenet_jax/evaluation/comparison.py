@@ -6,7 +6,7 @@ An image (H, W) float32 counts for the frame that is closest to it in time. Both
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple, cast
+from typing import NamedTuple, TypeVar, cast
 
 import jax
 import numpy as np
@@ -54,12 +54,15 @@ class Comparison(NamedTuple):
     flow: np.ndarray | None  # (H, W, 2) pixels since the frame before
 
 
+Prediction = TypeVar("Prediction")
+
+
 def matched(
-    predictions: Iterator[tuple[int, jax.Array]], times: np.ndarray, tolerance: int
-) -> Iterator[tuple[int, jax.Array]]:
-    """(time, image) in time order -> (place of a frame, image): of each frame the closest
-    prediction, if that is at most `tolerance` microseconds away."""
-    best: tuple[int, int, jax.Array] | None = None
+    predictions: Iterator[tuple[int, Prediction]], times: np.ndarray, tolerance: int
+) -> Iterator[tuple[int, Prediction]]:
+    """(time, image, or whatever is matched) in time order -> (place of a frame, image): of each
+    frame the closest prediction, if that is at most `tolerance` microseconds away."""
+    best: tuple[int, int, Prediction] | None = None
     for moment, image in predictions:
         after = int(np.searchsorted(times, moment))
         near = [place for place in (after - 1, after) if 0 <= place < len(times)]

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -91,7 +92,7 @@ def open_recording(
         if module.matches(path):
             if columns is not None and name not in ("text", "npy"):
                 raise RecordingError(f"{path}: is of a format that sets the order of its columns")
-            options = {} if columns is None else {"columns": columns}
+            options: dict[str, Any] = {} if columns is None else {"columns": columns}
             if name == "aedat2" and sensor_size is not None:  # its rows are counted from the bottom
                 options["size"] = sensor_size
             source = module.read(path, **options)
