@@ -112,7 +112,7 @@ def test_what_cannot_be_made_is_tried_once_and_warned_of_once(
         pytest.skip("no machine code for this processor")
     tries = []
 
-    def register(*_):
+    def register(*_, **__):
         tries.append(1)
         raise kind("no pages that may be run")
 

@@ -3,6 +3,7 @@
 import ast
 import errno
 import importlib
+import inspect
 import itertools
 import json
 import os
@@ -75,11 +76,12 @@ def test_help_breaks_no_line_and_speaks_no_python(capsys, monkeypatch, command):
     # An empty line is one between paragraphs of what stands above a box's rule.
     assert not re.search(r"^[│| ]+\n[│| ]+-", options, re.M)
     for word in ("None", "Raises", "True", "False", "__", "`threshold", "{", "Error"):
-        allowed = word == "{" and re.findall(r"{[a-z0-9,]+}", options)
+        allowed = word == "{" and re.findall(r"{[a-z0-9_,]+}", options)
         assert word not in options or allowed, word
     # Where there is room, each text is one line.
     module, kind, _ = cli.COMMANDS[command]
-    settings = ast.parse(Path(importlib.import_module(module).__file__).read_text()).body
+    source = inspect.getsourcefile(getattr(importlib.import_module(module), kind))
+    settings = ast.parse(Path(source).read_text()).body
     body = next(node for node in settings if getattr(node, "name", "") == kind).body
     pairs = [(a, b) for a, b in itertools.pairwise(body) if isinstance(a, ast.AnnAssign)]
     texts = [" ".join(b.value.value.split()) for _, b in pairs if isinstance(b, ast.Expr)]

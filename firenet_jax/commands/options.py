@@ -76,8 +76,10 @@ def _plain(hint: Any, text: str, required: bool) -> Any:
     if not required:  # tyro's place for the default: an empty one after a text can make a line
         said = {"help_behavior_hint": lambda default: text + _in_words(default)}
     inner = kind
-    if isinstance(kind, types.UnionType):
+    if typing.get_origin(kind) in (types.UnionType, typing.Union):
         inner = next(part for part in typing.get_args(kind) if part is not types.NoneType)
+        if typing.get_origin(inner) is typing.Literal:
+            said["metavar"] = f"{{{','.join(typing.get_args(inner))}}}"
     parts = typing.get_args(inner) if typing.get_origin(inner) is tuple else (inner,)
     if all(part in WORDS for part in parts):
         said["metavar"] = " ".join(WORDS[part] for part in parts).replace(" ...", "...")

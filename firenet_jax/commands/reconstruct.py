@@ -99,9 +99,8 @@ class Reconstruct:
     ]
     """Text, zip, HDF5, ECD or EVREAL folder, .bin, .dat, .raw, .aedat, .aedat4, .es, ROS bag."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """A folder (for png files and timestamps.txt), or a name that ends in .mp4, .gif, .h5 (float32
-    images), .bag (ROS 1) or .ros2 (ROS 2). With several recordings one entry each, named after
-    them, in the folder of that name."""
+    """A folder (png files and timestamps.txt), or a name that ends in .mp4, .gif, .h5 (float32
+    images), .bag or .ros2. Of several recordings one each, in the folder of that name."""
     weights: Annotated[Path | None, tyro.conf.arg(aliases=["-c"])] = None
     """Weights: .npz, a published PyTorch checkpoint, or the folder of a training run. Without:
     those that come with the package."""
