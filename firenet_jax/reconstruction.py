@@ -258,11 +258,11 @@ def _at_by_xla(recurrent: bool, dtype, weights: Weights, *inputs):
 
 def _at_by_machine_code(recurrent: bool, weights: Weights, committed: Committed, tensors, *inputs):
     packed, normalised = native.pack(weights.params), replace(weights, normalise=False)
-    native_step = partial(native.step, packed, normalise=weights.normalise)
-    enclosed = Committed(*(native.enclose(state) for state in committed))
-    enclosed, images = _scan_at(native_step, recurrent, normalised, enclosed, tensors, *inputs)
-    size = tensors.shape[2:4]
-    return Committed(*(State(*native.interior(state, *size)) for state in enclosed)), images
+    # Not in place: the state that a look begins from is still wanted.
+    native_step = partial(native.step, packed, normalise=weights.normalise, in_place=False)
+    committed = Committed(*map(tuple, committed))
+    committed, images = _scan_at(native_step, recurrent, normalised, committed, tensors, *inputs)
+    return Committed(*(State(*state) for state in committed)), images
 
 
 def _scan_at(step, recurrent: bool, weights: Weights, committed: Committed, tensors, steps, valid):

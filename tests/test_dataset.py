@@ -19,12 +19,14 @@ from firenet_jax.commands.simulate import (
     run,
     write_sequence,
 )
+from firenet_jax.errors import OutputError
 from firenet_jax.events import Events, concatenate
 from firenet_jax.readers import open_recording
 from firenet_jax.simulation.scenes import SceneSettings
 from firenet_jax.simulation.sensor import EPS
 from firenet_jax.simulation.textures import load_textures
-from firenet_jax.storage.files import OutputError, alone_in, locked
+from firenet_jax.storage.files import locked
+from firenet_jax.storage.runs import alone_in
 from firenet_jax.storage.video import write_video
 from firenet_jax.warp import warp
 

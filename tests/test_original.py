@@ -56,7 +56,7 @@ def test_pictures_of_a_real_recording(tmp_path, reference, recordings, auto_rang
     run(
         Reconstruct(
             (path,), tmp_path / "out", checkpoint, Windows(events=count),
-            Network(pad=16), Display(auto_range=auto_range),
+            network=Network(pad=16), display=Display(auto_range=auto_range),
         )
     )  # fmt: skip
     rows = np.loadtxt(path / "events.txt")
