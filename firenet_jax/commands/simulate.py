@@ -369,6 +369,7 @@ def run(settings: Simulate) -> list[Path]:
             return write_sequences(settings, height, width)
     if process:
         _wait_for(folder / "settings.json")
+    make_folder(folder)
     open_folder(settings)
     mine = folder / "running" / f"{process} of {processes}"
     with alone_in(mine):
