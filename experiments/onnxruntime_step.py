@@ -19,9 +19,9 @@ import onnxruntime
 from harness import interleaved, save, table
 
 import firenet_jax as fj
-from firenet_jax.events import parse_size
 from firenet_jax.export.onnx_model import onnx_model
 from firenet_jax.export.stablehlo import stablehlo
+from firenet_jax.settings import parse_size
 
 
 def tensors_like_events(windows: int, height: int, width: int) -> np.ndarray:

@@ -13,8 +13,8 @@ from typing import NamedTuple, overload
 
 import numpy as np
 
-from firenet_jax.errors import RecordingError, logger  # noqa: F401
-from firenet_jax.settings import LONGEST_SIDE, parse_size  # noqa: F401
+from firenet_jax.errors import RecordingError
+from firenet_jax.settings import LONGEST_SIDE
 
 BINS = 5  # of an event tensor: what a window is split into along time (Eq. 1)
 LATEST = 2**53  # microseconds, 285 years: float64 seconds lose microseconds beyond

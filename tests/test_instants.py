@@ -6,7 +6,8 @@ import pytest
 from test_tensors import random_events
 
 from firenet_jax import native
-from firenet_jax.events import Events, Recording, RecordingError
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, Recording
 from firenet_jax.instants import Counts, Grid, grid, steps
 from firenet_jax.network import Weights, initial_params, initial_state, step
 from firenet_jax.reconstruction import Committed, Looks, images_at, reconstruct, reconstruct_at

@@ -20,7 +20,7 @@ from firenet_jax.checkpoint import load_weights
 from firenet_jax.commands import reconstruct as pipeline
 from firenet_jax.commands.reconstruct import run
 from firenet_jax.commands.times import Times
-from firenet_jax.events import RecordingError
+from firenet_jax.errors import RecordingError
 from firenet_jax.instants import grid
 from firenet_jax.network import Weights
 from firenet_jax.pictures import Display, display, initial_display_state

@@ -9,7 +9,7 @@ import pytest
 from test_windows import recording_of
 
 from firenet_jax.commands.times import Times, times_of
-from firenet_jax.events import RecordingError
+from firenet_jax.errors import RecordingError
 from firenet_jax.instants import Grid
 
 T = 5_000_000 + np.arange(0, 2_000_000, 1000)  # 5 to 7 s on the sensor's clock

@@ -30,7 +30,9 @@ class Connection(NamedTuple):
 
 
 class Torn:
-    """What a reader of rosbags offers, as far as it is used here."""
+    """What a reader of rosbags offers, as far as it is used here; of MCAP too (`torn_mcap`)."""
+
+    magic, format = MAGIC, "bag"  # the first bytes; what such a file is called
 
     def __init__(self, path: Path):
         self.path = path
@@ -51,7 +53,7 @@ class Torn:
 
     def messages(self, connections, start: int | None = None) -> Iterator[tuple]:
         """(connection, time of recording in ns, bytes), not before `start`. Raises ValueError at
-        the end: a bag without an index was not closed."""
+        the end: a file without an index was not closed."""
         for connection, time, data in self._messages():
             if connection in connections and time >= (start or 0):
                 yield connection, time, data
@@ -60,8 +62,8 @@ class Torn:
     def _messages(self) -> Iterator[tuple]:
         with open(self.path, "rb") as file:
             try:
-                if file.read(len(MAGIC)) != MAGIC:
-                    raise ValueError("it is no bag")
+                if file.read(len(self.magic)) != self.magic:
+                    raise ValueError(f"it is no {self.format}")
                 yield from self._inside(file)
             except (ValueError, KeyError, struct.error, OSError, EOFError) as error:
                 self.ended = error

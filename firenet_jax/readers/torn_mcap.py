@@ -14,54 +14,27 @@ import io
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import pyarrow as pa
 
+from firenet_jax.readers import torn_bag
 from firenet_jax.readers.aedat4 import up_to
+from firenet_jax.readers.torn_bag import LARGEST, Connection
 
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK = 3, 4, 5, 6
-LARGEST = 1 << 28  # bytes of a record, as it is in the file and unpacked
 FARTHEST = 1 << 62  # bytes that can be passed over
 
 
-class Connection(NamedTuple):
-    topic: str
-    msgtype: str
+class Torn(torn_bag.Torn):
+    """Read in the same way; only what is inside differs."""
 
-
-class Torn:
-    """What a reader of rosbags offers, as far as it is used here."""
+    magic, format = MAGIC, "MCAP file"
 
     def __init__(self, path: Path):
-        self.path = path
         self.schemas: dict[int, str] = {}
-        self.known: dict[int, Connection] = {}
-        self.ended: Exception | None = None
-        for _ in self._messages():  # channels are told before their first message
-            pass
-
-    @property
-    def connections(self) -> list[Connection]:
-        return list(self.known.values())
-
-    def messages(self, connections, start: int | None = None) -> Iterator[tuple]:
-        """(connection, time of recording in ns, bytes), not before `start`. Raises ValueError at
-        the end: a file without an index was not closed."""
-        for connection, time, data in self._messages():
-            if connection in connections and time >= (start or 0):
-                yield connection, time, data
-        raise ValueError("it has no index, so it ends early") from self.ended
-
-    def _messages(self) -> Iterator[tuple]:
-        with open(self.path, "rb") as file:
-            try:
-                if file.read(len(MAGIC)) != MAGIC:
-                    raise ValueError("it is no MCAP file")
-                yield from self._inside(file)
-            except (ValueError, KeyError, struct.error, OSError, EOFError) as error:
-                self.ended = error
+        super().__init__(path)
 
     def _inside(self, file: BinaryIO) -> Iterator[tuple]:
         while head := file.read(9):
