@@ -357,6 +357,22 @@ DENSE = replace(
     scene=replace(AGED.scene, plain=0.2),
     sensor=replace(AGED.sensor, noise=(1e-3, 10.0), mismatch=0.02, asymmetry=0.18),
 )
+# Dense windows as often as sparse ones: "dense" had one above an event per pixel in twelve. Noise
+# alone in half of the sequences that stop for good, as much in light as in the dark, because images
+# sank to black where it is all that there is. More pictures, and twice as many textures.
+BROAD = replace(
+    DENSE,
+    textures=4096,
+    steps=1500,
+    warmup=30,
+    renderings=32,
+    motion=(1.0, 32.0),
+    slow=0.15,
+    learning_rate=1e-3,
+    seed=151,
+    loss=replace(DENSE.loss, contrast=2.0, equalised=1.5),
+    sensor=replace(DENSE.sensor, noise=(1e-3, 5.0)),
+)
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
@@ -380,6 +396,7 @@ STAGES = {
     "aged": (AGED, None),
     "noisy": (NOISY, 250),
     "dense": (DENSE, None),
+    "broad": (BROAD, None),
 }
 # Parts of a mean: what a stage starts from, if not from the one before.
 FIRST = {"even": 1, "usual": 1, "settle": 1, "natural": 9}

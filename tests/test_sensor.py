@@ -314,7 +314,7 @@ def test_leaks_are_on_events_at_their_rate_and_not_all_at_once():
 
 def noisy_sensor(rate, on=0.2, off=0.17):
     phase = jax.random.uniform(jax.random.key(1), (H, W))
-    return plain_sensor(on, off)._replace(noise=jnp.float32(rate), phase=phase)
+    return plain_sensor(on, off)._replace(noise=jnp.array([rate, 0.25]), phase=phase)
 
 
 def test_shot_noise_has_its_rate_and_no_order():
@@ -554,7 +554,7 @@ def test_rare_sequences_are_slow_and_calm_or_swift_before_a_blank_ground(texture
     assert usual.max() < 2.51  # or less: a window lasts 300 ms at most
     blank = np.ptp(np.asarray(scenes.textures[0]).reshape(96, -1), axis=1) == 0
     np.testing.assert_array_equal(blank, swift)
-    calm = np.asarray(sensors.noise) < 0.5
+    calm = np.asarray(sensors.noise[:, 0]) < 0.5
     assert not calm[~slow].any() and 0.4 < calm[slow].mean() < 0.9
     even, _, _ = make(slow=1e-9, swift=0.2)
     for name in ("on", "off"):
@@ -566,6 +566,23 @@ def test_rare_sequences_are_slow_and_calm_or_swift_before_a_blank_ground(texture
         assert (0.02 < spread).all() and (spread < 0.04).all()
     with pytest.raises(ValueError, match="together less than 1"):
         make(slow=0.6, swift=0.4)
+
+
+def test_half_of_the_sequences_that_stop_for_good_are_noisy_in_any_light(textures):
+    scene = replace(SETTINGS["scene"], halt=0.5)
+    settings = SETTINGS | {"batch": 200, "scene": scene}
+    sensors, scenes, durations = module.random_setups(jax.random.key(4), textures, **settings)
+    seconds = 1e-6 * np.asarray(durations)
+    stopped = np.diff(scenes.pauses[:, 0, :2])[:, 0] > T * seconds
+    rate, light = np.asarray(sensors.noise).T
+    noisy = light == 1
+    assert 0.35 < stopped.mean() < 0.65 and not noisy[~stopped].any()
+    assert 0.3 < noisy[stopped].mean() < 0.7
+    in_a_window = (rate * seconds)[noisy]
+    assert (in_a_window > 0.0099).all() and (in_a_window < 0.701).all()
+    usual = sensors.noise[~noisy]
+    np.testing.assert_array_equal(usual[:, 1], 0.25)
+    assert (usual[:, 0] <= FAULTY.noise[1]).all()
 
 
 @pytest.mark.slow

@@ -36,6 +36,7 @@ from firenet_jax.simulation.scenes import Scene, SceneSettings, flow, random_sce
 
 EPS = 0.001
 THRESHOLD, SPREAD, REFRACTORY = 0.18, 0.03, 1e-3  # as in the paper, where nothing is said
+NOISE_IN_LIGHT = 0.25  # of that in the dark
 TICKS = 1024  # in a microsecond
 AT_ONCE = 4  # events of a pixel in one pass over the picture: fewer passes, less memory traffic
 LONGEST = 2**31 // TICKS - 1  # microseconds between two renderings
@@ -43,6 +44,9 @@ SLOW, SWIFT = (0.02, 0.3), (16.0, 90.0)  # pixels a window, of rare sequences
 UNEVEN = 4.0  # times the mismatch of others: pixels of one edge fire one by one, not together
 # Of the slow ones: next to no faults, so that single events can be trusted.
 NEARLY_NOISELESS = 2 / 3
+# Of those that stop for good half have noise, so many events per pixel and window, as much in light
+# as in the dark: windows of a count hold nothing else then, and it says nothing of what is seen.
+AT_REST = (0.01, 0.7)
 
 
 def _or(said: float | None, default: float) -> float:
@@ -152,7 +156,9 @@ class Sensor(NamedTuple):
     off: jax.Array
     refractory: jax.Array | None  # () int32, ticks
     drift: jax.Array | None  # (H, W) log intensity per second, by which L seems to rise
-    noise: jax.Array | None  # () events per second and pixel in the dark
+    noise: (
+        jax.Array | None
+    )  # (2,) events per second and pixel in the dark, part of it in full light
     cutoff: jax.Array | None  # (2,) hertz in full light, and the part of it left in the dark
     phase: jax.Array | None  # (H, W) part of the first threshold already gone, where L drifts, and
     # whether noise begins with ON: else all pixels would begin with the same event
@@ -231,7 +237,9 @@ def random_sensor(
         if refractory is None
         else jnp.round(refractory * 1e6 * TICKS).astype(jnp.int32),
         drift=drift,
-        noise=log_uniform(settings.noise) if _on(settings.noise) else None,
+        noise=jnp.stack([log_uniform(settings.noise), jnp.float32(NOISE_IN_LIGHT)])
+        if _on(settings.noise)
+        else None,
         cutoff=jnp.stack([log_uniform(settings.cutoff), jnp.float32(settings.cutoff_dark)])
         if _on(settings.cutoff)
         else None,
@@ -302,7 +310,8 @@ def step(
     runs, noise_on = (run,), state.noise_on
     if sensor.noise is not None:
         key = jax.random.fold_in(sensor.key, state.renderings)
-        expected = seconds * sensor.noise * (1 - 0.75 * image)
+        rate, light = sensor.noise
+        expected = seconds * rate * (1 - (1 - light) * image)
         noise = _shot_noise(key, expected, jnp.where(noise_on, 1.0, -1.0), ticks)
         noise_on = noise_on ^ (noise.count > 0)
         runs += (noise,)
@@ -561,6 +570,7 @@ def random_setups(
     pixels' thresholds differ `UNEVEN` times as much, and most have a fiftieth of noise and leaks),
     and in which much does before a blank ground
     (`SWIFT` pixels, from one rendering to the next by more than one).
+    Where the sensor has noise, half of the scenes that stop for good are noisy (`AT_REST`).
     Raises SettingsError where `motion` is more than a pixel from one rendering to the next, the
     bound of Gehrig et al., "Video to Events", CVPR 2020, or slow and swift leave nothing.
     """
@@ -592,6 +602,10 @@ def random_setups(
         grey = jax.random.uniform(grey_key, (batch, 1, 1), minval=0.2, maxval=0.8)
         ground = jnp.where(is_swift[:, None, None], grey, scenes.textures[0])
         scenes = scenes._replace(textures=(ground, *scenes.textures[1:]))
+    if scene.halt and sensors.noise is not None:
+        sensors = _noisy_at_rest(
+            jax.random.fold_in(number_key, 2), sensors, scenes, windows, duration
+        )
     return sensors, scenes, duration
 
 
@@ -633,10 +647,24 @@ def _uneven(sensors: Sensor, kind: jax.Array, is_slow: jax.Array, slow: float) -
         sensors = sensors._replace(on=uneven(sensors.on), off=uneven(sensors.off))
     share = jnp.where(kind < NEARLY_NOISELESS * slow, 0.02, 1.0)
     if sensors.noise is not None:
-        sensors = sensors._replace(noise=sensors.noise * share)
+        sensors = sensors._replace(noise=sensors.noise.at[:, 0].multiply(share))
     if sensors.drift is not None:
         sensors = sensors._replace(drift=sensors.drift * share[:, None, None])
     return sensors
+
+
+def _noisy_at_rest(
+    key: jax.Array, sensors: Sensor, scenes: Scene, windows: int | jax.Array, duration: jax.Array
+) -> Sensor:
+    """Noise (see `AT_REST`) for half of the sequences that stop for good."""
+    seconds = 1e-6 * duration
+    stopped = scenes.pauses[:, 0, 1] - scenes.pauses[:, 0, 0] > windows * seconds
+    low, high = (math.log(bound) for bound in AT_REST)
+    noisy, share = jax.random.uniform(key, (2, len(duration)))
+    rate = jnp.exp(low + (high - low) * share) / seconds
+    chosen = (stopped & (noisy < 0.5))[:, None]
+    uniform = jnp.stack([rate, jnp.ones_like(rate)], -1)
+    return sensors._replace(noise=jnp.where(chosen, uniform, sensors.noise))
 
 
 def window_bounds(durations: jax.Array, windows: int, first: jax.Array | int = 0) -> jax.Array:
