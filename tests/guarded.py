@@ -15,8 +15,7 @@ import numpy as np
 from test_trial import random_case
 
 from firenet_jax import native
-from firenet_jax.native import llvm, whole_step
-from firenet_jax.native.convolve3x3 import Layer, _convolution, _parts, _sums, _total
+from firenet_jax.native import convolve3x3, kernel_gradient, llvm, whole_step
 
 PAGE = mmap.PAGESIZE
 _protect = ctypes.CDLL(None, use_errno=True).mprotect
@@ -81,33 +80,40 @@ def check_layer(height, width, inputs, outputs, at_end):
     gradient = rng.normal(size=(batch, height, width, outputs))
     kernel = rng.normal(size=(3, 3, inputs, outputs))
     image, gradient, kernel = (jnp.asarray(x, jnp.float32) for x in (image, gradient, kernel))
-    parts, numbers = _parts(height), kernel.size + outputs
-    layer = Layer(height, width, (inputs,), ("none",), outputs, False)
+    layer = convolve3x3.Layer(height, width, (inputs,), ("none",), outputs, False)
     memory = run(
-        lambda module: [_convolution(module, layer)],
-        [image, kernel, np.full(gradient.shape, np.nan)],
+        lambda module: convolve3x3._stages(module, layer),
+        [image, convolve3x3._kernel(layer, kernel), np.full(gradient.shape, np.nan)],
         batch,
-        parts,
+        -(-height // convolve3x3.ROWS),
         at_end,
     )
     np.testing.assert_array_equal(memory[2], np.ravel(native.convolve([image], kernel)[0]))
+    channels = (inputs,), (outputs,)
+    numbers, parts = kernel_gradient._numbers(*channels), kernel_gradient._parts(height)
     memory = run(
-        lambda module: [
-            _sums(module, height, width, (inputs,), (outputs,)),
-            _total(module, batch, height, 2, numbers),
-        ],
+        lambda module: kernel_gradient._stages(module, batch, height, width, *channels),
         [image, gradient, np.full(numbers, np.nan), np.full(batch * parts * numbers, np.nan)],
         batch,
         parts,
         at_end,
     )
-    expected = jax.tree.leaves(native.gradients([image], kernel, [gradient]))
-    np.testing.assert_array_equal(memory[2], np.concatenate([x.ravel() for x in expected]))
+    is_winograd = kernel_gradient._is_winograd(*channels)
+    found = kernel_gradient._gradients(jnp.asarray(memory[2]), kernel, is_winograd)
+    jax.tree.map(
+        np.testing.assert_array_equal, found, native.gradients([image], kernel, [gradient])
+    )
 
 
 if __name__ == "__main__":
     for at_end in (True, False):
         for size in [(1, 1), (5, 9), (13, 25), (4, 70)]:
             check_step(*size, normalise=size[0] % 2 == 1, at_end=at_end)
-        for case in [(1, 1, 5, 16), (7, 9, 16, 32), (5, 70, 32, 16)]:
+        for case in [
+            (1, 1, 5, 16),
+            (7, 9, 16, 32),
+            (5, 70, 32, 16),
+            (1, 1, 16, 16),
+            (9, 33, 16, 16),
+        ]:
             check_layer(*case, at_end=at_end)

@@ -11,8 +11,7 @@ import pytest
 pytest.importorskip("llvmlite")
 
 from firenet_jax import convolution, native
-from firenet_jax.native import Unavailable, llvm
-from firenet_jax.native.convolve3x3 import Layer, _convolution, _parts, _sums, _total
+from firenet_jax.native import Unavailable, convolve3x3, kernel_gradient, llvm
 
 pytestmark = pytest.mark.skipif(
     jax.default_backend() != "cpu" or llvm.vectors() == 0,
@@ -84,7 +83,7 @@ def test_on_processors_with_vectors_of_256_bits(monkeypatch):
     features = llvm.binding.FeatureMap({"avx2": True, "fma": True})
     monkeypatch.setattr(llvm.binding, "get_host_cpu_name", lambda: "haswell")
     monkeypatch.setattr(llvm.binding, "get_host_cpu_features", lambda: features)
-    for shape in [(2, 10, 33, 5, 16), (1, 9, 21, 32, 32)]:
+    for shape in [(2, 10, 33, 5, 16), (1, 9, 21, 32, 32), (2, 9, 29, 16, 16)]:
         image, kernel, gradient = random_case(*shape)
         result, by_kernel = exact(image, kernel, gradient)
         jax.tree.map(assert_same, ours(image, kernel, gradient), (result, by_kernel))
@@ -148,13 +147,26 @@ def test_what_it_does_not_compute(image, kernel):
 @pytest.mark.parametrize("where", ["image", "kernel"])
 @pytest.mark.parametrize("what", [np.nan, np.inf, -np.inf])
 def test_what_is_not_finite_goes_where_it_goes_in_xla(where, what):
-    image, kernel, _ = random_case(1, 6, 30, 16, 16)
+    """Where the convolution is direct; Winograd's tiles carry it a little farther."""
+    image, kernel, _ = random_case(1, 6, 30, 32, 16)
     if where == "image":
         image[0, 2, 29, 3] = what
     else:
         kernel[0, 1, 3, 4] = what
     (found,) = native.convolve([jnp.asarray(image)], jnp.asarray(kernel))
     np.testing.assert_array_equal(np.isnan(found), np.isnan(convolution._plain(image, kernel)))
+
+
+def test_what_is_not_finite_stays_so_and_near():
+    image, kernel, gradient = random_case(1, 30, 30, 16, 16)
+    image[0, 12, 15, 3] = np.nan
+    (found,) = native.convolve([jnp.asarray(image)], jnp.asarray(kernel))
+    lost = np.isnan(found).all((0, 3))
+    assert lost[11:14, 14:17].all() and not lost[:8].any() and not lost[20:].any()
+    assert not lost[:, :12].any() and not lost[:, 19:].any()
+    by_kernel, by_bias = native.gradients([image], kernel, [gradient])
+    assert np.isnan(by_kernel[:, :, 3]).all() and np.isfinite(by_kernel[:, :, 4]).all()
+    assert np.isfinite(by_bias).all()
 
 
 CANARY, SIDE = np.nan, 64
@@ -172,9 +184,9 @@ def test_nothing_is_read_or_written_beside_the_arrays(shape):
     batch, height, width, inputs, outputs = shape
     image, kernel, gradient = random_case(*shape)
     result, by_kernel = exact(image, kernel, gradient)
-    parts, numbers = _parts(height), kernel.size + outputs
+    channels = (inputs,), (outputs,)
 
-    def run(write, arrays):
+    def run(write, arrays, parts):
         module = llvm.Module()
         stages = write(module)
         for stage in stages:
@@ -192,20 +204,23 @@ def test_nothing_is_read_or_written_beside_the_arrays(shape):
             np.testing.assert_array_equal(each[-SIDE:], old[-SIDE:])
         return [each[SIDE:-SIDE] for each in memory]
 
-    layer = Layer(height, width, (inputs,), ("none",), outputs, False)
+    layer = convolve3x3.Layer(height, width, (inputs,), ("none",), outputs, False)
     *_, found = run(
-        lambda module: [_convolution(module, layer)], [image, kernel, np.zeros_like(gradient)]
+        lambda module: convolve3x3._stages(module, layer),
+        [image, np.asarray(convolve3x3._kernel(layer, kernel)), np.zeros_like(gradient)],
+        -(-height // convolve3x3.ROWS),
     )
     assert_same(found.reshape(result.shape), result)
+    numbers, parts = kernel_gradient._numbers(*channels), kernel_gradient._parts(height)
     *_, found, _ = run(
-        lambda module: [
-            _sums(module, height, width, (inputs,), (outputs,)),
-            _total(module, batch, height, 2, kernel.size + outputs),
-        ],
+        lambda module: kernel_gradient._stages(module, batch, height, width, *channels),
         [image, gradient, np.zeros(numbers), np.zeros(batch * parts * numbers)],
+        parts,
     )
-    assert_same(found[: kernel.size].reshape(kernel.shape), by_kernel)
-    assert_same(found[kernel.size :], gradient.astype(np.float64).sum((0, 1, 2)))
+    is_winograd = kernel_gradient._is_winograd(*channels)
+    found, by_bias = kernel_gradient._gradients(jnp.asarray(found), kernel, is_winograd)
+    assert_same(found, by_kernel)
+    assert_same(by_bias, gradient.astype(np.float64).sum((0, 1, 2)))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from test_network import random_run
 
 from firenet_jax import native, network
-from firenet_jax.native import llvm, whole_step
+from firenet_jax.native import llvm, winograd
 from firenet_jax.network import State, Weights, initial_state
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.tensors import normalise
@@ -77,7 +77,7 @@ def test_normalises_as_tensors_do(height, width):
 
 @pytest.mark.parametrize("halves", [(1,), (1, 2), (5 / 8, 3 / 2)])
 def test_winograd_is_a_correlation(halves):
-    direction = whole_step._winograd(*halves)
+    direction = winograd._winograd(*halves)
     rng = np.random.default_rng(0)
     pixels, kernel = rng.normal(size=direction.patch), rng.normal(size=3)
     products = (direction.kernel @ kernel) * (direction.input @ pixels)

@@ -15,7 +15,7 @@ from firenet_jax.native.choice import Unavailable, by_xla_alone, choose, is_want
 
 _HOME = {
     "convolve": "convolve3x3",
-    "gradients": "convolve3x3",
+    "gradients": "kernel_gradient",
     "pack": "whole_step",
     "step": "whole_step",
 }

@@ -164,6 +164,15 @@ class Function:
     def min(self, a, b):
         return self.b.select(self.less(a, b), integer(a), integer(b))
 
+    def rows(self, part, each: int, height: int):
+        """Of this part, of so many rows each: the first row, and the one after the last."""
+        first = self.times(part, each)
+        return first, self.min(self.b.add(first, integer(each)), height)
+
+    def pointers(self, pointer, count: int) -> list:
+        """So many that lie one after the other."""
+        return [self.load(POINTER, pointer, 8 * i) for i in range(count)]
+
     # Control
 
     def external(self, name: str, result, *arguments) -> Code:

@@ -1,18 +1,12 @@
 """(packed parameters, states, event tensor) -> (states, image): the step of a CPU, as machine code.
 
 The function of `network.step`, float32, equal to rounding, without a gradient. On a CPU, XLA's time
-goes into 3x3 convolutions of 16 channels that run near the processor's rate already: less time
-takes fewer products, for which XLA has no operation. Here the whole step is one function that XLA's
-programs call, compiled for the processor at hand when an image size is first seen.
+goes into 3x3 convolutions of 16 channels. Here the whole step is one function that XLA's programs
+call, compiled for the processor at hand when an image size is first seen.
 
-Convolutions are Winograd's F(4x2, 3x3) (Lavin and Gray, "Fast Algorithms for Convolutional Neural
-Networks", CVPR 2016, Eqs. 5 to 8): 24 products instead of 72 for 4 rows of 2 pixels,
-
-    Y = A^T [sum over inputs of (G g G^T) * (B^T d B)] A
-
-with * element by element, d a patch of 6x4 pixels of an input and g its kernel. States are (H, W)
-pixels of 16 channels, as everywhere. A map within the step is (H + 2, W + 2) of them, H and W
-rounded up to whole tiles, zero wherever there is no pixel of the image.
+Convolutions are Winograd's (`winograd`). States are (H, W) pixels of 16 channels, as everywhere. A
+map within the step is (H + 2, W + 2) of them, H and W rounded up to whole tiles, zero wherever
+there is no pixel of the image.
 """
 
 from collections.abc import Callable
@@ -20,7 +14,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from firenet_jax.native.choice import Unavailable, made
 from firenet_jax.native.foreign_call import register
@@ -38,58 +31,20 @@ from firenet_jax.native.llvm import (
     vector,
     vectors,
 )
+from firenet_jax.native.winograd import (
+    COLUMNS,
+    GROUPS,
+    PIXEL,
+    PLACES,
+    ROWS,
+    STEP,
+    Block,
+    Tiling,
+    kernels,
+)
 
-CHANNELS, BINS = LANES, 5  # the network's
-PIXEL = 4 * CHANNELS  # bytes
-STEP = 8  # inputs of a convolution between two jumps; the event tensor's 5 become so many
+CHANNELS, BINS = LANES, 5  # the network's; in steps the 5 become 8
 
-
-class Winograd(NamedTuple):
-    """F(tile, 3): so many outputs in one direction, of `patch` pixels, with as many products."""
-
-    tile: int
-    patch: int
-    kernel: np.ndarray  # G
-    input: np.ndarray  # B^T
-    butterfly: np.ndarray
-    output: np.ndarray  # A^T is output @ butterfly
-
-
-def _winograd(*halves: float) -> Winograd:
-    """Interpolation at each of these numbers and its negative, at 0, and at infinity."""
-    points = [*(sign * half for half in halves for sign in (1, -1)), 0.0]
-    tile, patch = len(points) - 1, len(points) + 1
-    kernel, polynomials = [], []
-    for point in points:
-        others = [other for other in points if other != point]
-        scale = np.prod([point - other for other in others])
-        kernel.append([point**k / scale for k in range(3)])
-        polynomials.append([*np.poly(others)[::-1], 0])
-    # What belongs to a number and its negative is added and subtracted first.
-    butterfly, output = np.eye(patch), np.zeros((tile, patch))
-    output[0, -2] = output[-1, -1] = 1
-    for i, half in zip(range(0, patch, 2), halves, strict=False):
-        butterfly[i : i + 2, i : i + 2] = [[1, 1], [1, -1]]
-        for k in range(tile):
-            output[k, i + k % 2] = half**k
-    polynomials.append(np.poly(points)[::-1])
-    return Winograd(
-        tile,
-        patch,
-        np.array([*kernel, [0, 0, 1]], np.float32),
-        np.array(polynomials),
-        butterfly,
-        output,
-    )
-
-
-# Of F(4, 3)'s numbers with few bits those of the least error; the usual 1 and 2 have twice of it.
-# F(4, 3) in both directions is a tenth faster, but not exact to 1e-5 in all states.
-ROWS, COLUMNS = _winograd(5 / 8, 3 / 2), _winograd(1)
-# Two of the six rows of transformed patches at a time: with the kernels for them and the pixels
-# that they are made of they stay in the nearest cache, all six would not.
-GROUPS = [slice(row, row + 2) for row in range(0, ROWS.patch, 2)]
-PLACES = 2 * COLUMNS.patch  # of two rows
 
 # --- The network -------------------------------------------------------------------------------
 
@@ -180,8 +135,7 @@ def pack(params) -> jax.Array:
         convolutions += [*halves, params[gru]["candidate"], block["conv1"], block["conv2"]]
     # All kernels in one product: one by one they take twice as long.
     flat = [convolution["kernel"].reshape(9, -1) for convolution in convolutions]
-    both = np.kron(ROWS.kernel, COLUMNS.kernel)
-    flat = jnp.matmul(both, jnp.concatenate(flat, 1), precision="highest")
+    flat = kernels(jnp.concatenate(flat, 1))
     parts, start = [], 0
     for convolution in convolutions:
         _, _, inputs, outputs = convolution["kernel"].shape
@@ -197,29 +151,8 @@ def pack(params) -> jax.Array:
 # --- Its stages, four rows at a time -----------------------------------------------------------
 
 
-class Size(NamedTuple):
-    """Of images, and of their tiles."""
-
-    height: int
-    width: int
-
-    @property
-    def block(self) -> int:
-        """Tiles of a row that are worked on together, their sums in registers.
-
-        A number that leaves little over: a block of n costs about as much as n + 1. With more than
-        8, caches overflow; with fewer, products wait for the sums that they are added to.
-        """
-        most = min(self.across, 8 if vectors() == 32 else 6)
-        return min(range(1, most + 1), key=lambda n: -(-self.across // n) * (n + 1))
-
-    @property
-    def down(self) -> int:
-        return -(-self.height // ROWS.tile)
-
-    @property
-    def across(self) -> int:
-        return -(-self.width // COLUMNS.tile)
+class Size(Tiling):
+    """Of images, their tiles, and of maps within the step."""
 
     @property
     def line(self) -> int:
@@ -234,11 +167,6 @@ class Size(NamedTuple):
         return self.height * self.width * PIXEL
 
     @property
-    def patch(self) -> tuple[int, int]:
-        """Rows and columns of pixels that a block is made of."""
-        return ROWS.patch, COLUMNS.tile * self.block + 2
-
-    @property
     def moments(self) -> int:
         """Bytes of what is known of the numbers of each four rows of an event tensor."""
         return -(-len(MOMENTS) * 4 * self.down // PIXEL) * PIXEL
@@ -246,129 +174,6 @@ class Size(NamedTuple):
     @property
     def inner(self) -> int:
         return len(INNER) * self.map + self.moments
-
-    @property
-    def place(self) -> int:
-        """Bytes of one place of all tiles of a block."""
-        return self.block * PIXEL
-
-
-def _linear(f: Function, matrix: np.ndarray, values: list) -> list:
-    """The matrix times vectors; None for a row of zeros.
-
-    Two rows that differ only in signs share what they have in common.
-    """
-
-    def combined(row):
-        result = None
-        for factor, value in zip(row, values, strict=True):
-            if factor and result is None:
-                result = value if factor == 1 else f.b.fmul(vector(factor), value)
-            elif factor:
-                result = f.fma(vector(factor), value, result)
-        return result
-
-    results = []
-    for i, row in enumerate(matrix):
-        before, after = matrix[i - 1] if i else None, matrix[min(i + 1, len(matrix) - 1)]
-        if i and np.array_equal(abs(row), abs(before)) and not np.array_equal(row, before):
-            continue
-        if np.array_equal(abs(row), abs(after)) and not np.array_equal(row, after):
-            same = combined(np.where(row == after, row, 0))
-            other = combined(np.where(row == after, 0, row))
-            results += [f.b.fadd(same, other), f.b.fsub(same, other)]
-        else:
-            results.append(combined(row))
-    return results
-
-
-def _transform(module: Module, size: Size, rows: slice) -> Code:
-    """transform(upper left neighbour of a block, bytes of a row, transformed): B^T d B.
-
-    Transformed are (places, tiles).
-    """
-    f = Function(module, f"transform{rows.start}", [POINTER, INT, POINTER])
-    f.function.attributes.add("noinline")
-    corner, line, transformed = f.arguments
-    lines = [f.times(line, y) for y in range(ROWS.patch)]
-
-    def column(pixel, x):
-        pixels = [f.load(VECTOR, pixel, line, x * PIXEL) for line in lines]
-        return _linear(f, ROWS.input[rows], pixels)
-
-    def tile(t, left):
-        """The first two of its columns are the last two of the tile to the left."""
-        here = f.at(corner, f.times(t, COLUMNS.tile * PIXEL))
-        new = [column(here, x) for x in range(2, COLUMNS.patch)]
-        columns = [left[:2], left[2:], *new]
-        for i, row in enumerate(zip(*columns, strict=True)):
-            for j, value in enumerate(_linear(f, COLUMNS.input, list(row))):
-                f.store(value, transformed, f.times(t, PIXEL), (COLUMNS.patch * i + j) * size.place)
-        return [*columns[-2], *columns[-1]]
-
-    f.loop(0, size.block, tile, [*column(corner, 0), *column(corner, 1)])
-    f.b.ret_void()
-    return f.function
-
-
-def _multiply(module: Module, size: Size) -> Code:
-    """multiply(transformed, kernels, sums, maps, channels of each): sums, (places, tiles)."""
-    f = Function(module, "multiply", [POINTER, POINTER, POINTER, INT, INT])
-    f.function.attributes.add("noinline")
-    transformed, kernels, sums, maps, channels = f.arguments
-    inputs = f.b.mul(maps, channels)
-
-    def place(i, _):
-        def source(s, values):
-            tiles = f.at(transformed, f.times(s, PLACES * size.place), f.times(i, size.place))
-            row = f.b.add(f.b.mul(i, inputs), f.b.mul(s, channels))
-            kernel = f.at(kernels, f.times(row, PIXEL))
-
-            def steps(i, values):
-                for c in range(STEP):
-                    outputs = f.load(VECTOR, kernel, f.times(i, STEP * PIXEL), c * PIXEL)
-                    numbers = f.at(tiles, f.times(i, 4 * STEP), 4 * c)
-                    values = [
-                        f.fma(f.splat(f.load(FLOAT, numbers, t * PIXEL)), outputs, value)
-                        for t, value in enumerate(values)
-                    ]
-                return values
-
-            return f.loop(0, f.b.sdiv(channels, integer(STEP)), steps, values)
-
-        values = f.loop(0, maps, source, [vector(0)] * size.block)
-        for t, value in enumerate(values):
-            f.store(value, sums, f.times(i, size.place), t * PIXEL)
-
-    f.loop(0, PLACES, place)
-    f.b.ret_void()
-    return f.function
-
-
-def _restore(module: Module, size: Size, rows: slice) -> Code:
-    """restore(sums, pixels): A^T sums A, added to the pixels of the block; the first rows begin."""
-    f = Function(module, f"restore{rows.start}", [POINTER, POINTER])
-    f.function.attributes.add("noinline")
-    sums, pixels = f.arguments
-
-    def tile(t, _):
-        here = f.at(sums, f.times(t, PIXEL))
-        places = [f.load(VECTOR, here, i * size.place) for i in range(PLACES)]
-        across = []
-        for row in (places[: COLUMNS.patch], places[COLUMNS.patch :]):
-            across.append(_linear(f, COLUMNS.output, _linear(f, COLUMNS.butterfly, row)))
-        for x, pair in enumerate(zip(*across, strict=True)):
-            pair = _linear(f, ROWS.butterfly[rows, rows], list(pair))
-            for y, value in enumerate(_linear(f, ROWS.output[:, rows], pair)):
-                place = f.at(pixels, f.times(t, COLUMNS.tile * PIXEL))
-                place = f.at(place, y * COLUMNS.tile * size.place + x * PIXEL)
-                if value is not None:
-                    before = f.load(VECTOR, place) if rows.start else None
-                    f.store(f.b.fadd(before, value) if before else value, place)
-
-    f.loop(0, size.block, tile)
-    f.b.ret_void()
-    return f.function
 
 
 def _arrays(f: Function, size: Size, pointers, image) -> dict:
@@ -390,12 +195,6 @@ def _arrays(f: Function, size: Size, pointers, image) -> dict:
     return arrays | {name: f.at(moments, i * 4 * size.down) for i, name in enumerate(MOMENTS)}
 
 
-def _rows(f: Function, size: Size, part):
-    """Of this part: the first row, and the one after the last."""
-    first = f.times(part, ROWS.tile)
-    return first, f.min(f.b.add(first, integer(ROWS.tile)), size.height)
-
-
 def _border(f: Function, size: Size, map, part) -> None:
     """Zeros around the rows of this part."""
 
@@ -409,7 +208,7 @@ def _border(f: Function, size: Size, map, part) -> None:
         clear(line, 0, 1)
         clear(line, size.width + 1, columns)
 
-    first, last = _rows(f, size, part)
+    first, last = f.rows(part, ROWS.tile, size.height)
     f.loop(first, last, sides)
     for here, start, stop in (
         (0, 0, 1),
@@ -472,7 +271,7 @@ def _moments(module: Module, size: Size, terms: dict[str, Callable]) -> Code:
     f = Function(module, "moments_" + "_".join(terms), [POINTER, INT, INT])
     pointers, image, part = f.arguments
     arrays = _arrays(f, size, pointers, image)
-    top, bottom = _rows(f, size, part)
+    top, bottom = f.rows(part, ROWS.tile, size.height)
     events = f.at(arrays["events"], f.times(top, 4 * BINS * size.width))
     count = f.times(f.b.sub(bottom, top), BINS * size.width)
     term_of = [term(f, size, arrays) for term in terms.values()]
@@ -506,7 +305,7 @@ def _events(module: Module, size: Size, becomes: Callable) -> Code:
 
         f.loop(0, size.width, pixel)
 
-    f.loop(*_rows(f, size, part), row)
+    f.loop(*f.rows(part, ROWS.tile, size.height), row)
     _border(f, size, arrays["tensor"], part)
     f.b.ret_void()
     return f.function
@@ -518,22 +317,20 @@ def _stage(
     name: str,
     stage: Stage,
     weights: int,
-    transform: list[Code],
-    multiply: Code,
-    restore: list[Code],
+    convolutions: Block,
 ) -> Code:
     """Four rows of a stage whose weights begin at this byte."""
     f = Function(module, name, [POINTER, INT, INT])
     pointers, image, part = f.arguments
     arrays = _arrays(f, size, pointers, image)
-    transformed = f.alloca(len(stage.sources) * PLACES * size.place)
-    sums = f.alloca(PLACES * size.place)
+    memory = convolutions.memory(f, len(stage.sources), len(stage.layers))
     enclosed = f.alloca(size.patch[0] * size.patch[1] * PIXEL)
-    pixels = [f.alloca(ROWS.tile * COLUMNS.tile * size.place) for _ in stage.layers]
+    inputs = _inputs(stage)
+    starts = [weights + i * _weights_of_layer(stage) for i in range(len(stage.layers))]
     f.exists = f.splat(f.load(FLOAT, arrays["exists"]))
     f.prediction = f.load(VECTOR, arrays["weights"], _weights(len(STAGES)))
     f.offset = f.load(FLOAT, arrays["weights"], _weights(len(STAGES)) + PIXEL)
-    top, bottom = _rows(f, size, part)
+    top, bottom = f.rows(part, ROWS.tile, size.height)
 
     def finish(layer, bias, pixels, left, fresh):
         """What the layer makes of the pixels of the block that are in the image."""
@@ -543,7 +340,7 @@ def _stage(
             line = f.b.add(f.times(y, size.line), f.times(left, PIXEL))
             line = f.b.add(line, integer(size.line + PIXEL))
             places = f.b.add(f.times(y, size.width), left)
-            sums_of_row = f.at(pixels, f.times(f.b.sub(y, top), COLUMNS.tile * size.place))
+            sums_of_row = f.at(pixels, f.times(f.b.sub(y, top), convolutions.line))
 
             def pixel(x, _):
                 place = f.b.add(places, x)
@@ -570,6 +367,10 @@ def _stage(
         area = size.height, size.width
         return f.patch(arrays[source], area, PIXEL, upper_left, size.patch, enclosed)
 
+    def kernel(group, layer):
+        before = PIXEL + group * PLACES * inputs * PIXEL
+        return f.at(arrays["weights"], starts[layer] + before)
+
     def block(i, _):
         # The last block begins early enough to end with the row; what the one before it has
         # finished is left alone, because a state changes in place.
@@ -577,18 +378,8 @@ def _stage(
         first = f.min(wanted, size.across - size.block)
         left, fresh = f.times(first, COLUMNS.tile), f.times(f.b.sub(wanted, first), COLUMNS.tile)
         corners = [corner(source, left) for source in stage.sources]
-        maps, inputs = len(stage.sources), _inputs(stage)
-        starts = [weights + i * _weights_of_layer(stage) for i in range(len(stage.layers))]
-        for group, (forth, back) in enumerate(zip(transform, restore, strict=True)):
-            for s, (corner_of_map, line) in enumerate(corners):
-                there = f.at(transformed, s * PLACES * size.place)
-                f.b.call(forth, [corner_of_map, line, there])
-            for start, of_layer in zip(starts, pixels, strict=True):
-                kernels = f.at(arrays["weights"], start + PIXEL + group * PLACES * inputs * PIXEL)
-                each = integer(inputs // maps)
-                f.b.call(multiply, [transformed, kernels, sums, integer(maps), each])
-                f.b.call(back, [sums, of_layer])
-        for layer, start, of_layer in zip(stage.layers, starts, pixels, strict=True):
+        convolutions.write(f, memory, corners, inputs, kernel, rows=inputs)
+        for layer, start, of_layer in zip(stage.layers, starts, memory[2], strict=True):
             finish(layer, f.load(VECTOR, arrays["weights"], start), of_layer, left, fresh)
 
     f.loop(0, -(-size.across // size.block), block)
@@ -617,12 +408,9 @@ def _stages(module: Module, size: Size, normalise: bool) -> list[Code]:
         first.append(_events(module, size, _normalised))
     else:
         first = [_events(module, size, _itself)]
-    transform, restore = (
-        [write(module, size, rows) for rows in GROUPS] for write in (_transform, _restore)
-    )
-    multiply = _multiply(module, size)
+    convolutions = Block(module, size)
     return first + [
-        _stage(module, size, f"stage{i}", stage, _weights(i), transform, multiply, restore)
+        _stage(module, size, f"stage{i}", stage, _weights(i), convolutions)
         for i, stage in enumerate(STAGES)
     ]
 

@@ -218,17 +218,20 @@ def images_of(
     state: before the first window; None is the zero state.
     """
     run = partial(step, dtype=jnp.bfloat16 if settings.bfloat16 else jnp.float32)
-    # What a step keeps for the gradient goes through memory twice: of the rest, that is slower than
-    # to compute it again.
-    kept = () if settings.remat else (CONVOLVED,)
-    policy = jax.checkpoint_policies.save_only_these_names(*kept)
-    run = jax.checkpoint(run, policy=policy, prevent_cse=False)
+    # On a CPU what a loop keeps for the gradient goes through memory three times more (zeros, in,
+    # out), a sixth of the time; as there are few windows, they can stand in the program one by one.
+    one_by_one = jax.default_backend() == "cpu" and not (settings.bfloat16 or settings.remat)
+    if not one_by_one:
+        # Of the rest of what it needs, to keep it is slower than to compute it again.
+        kept = () if settings.remat else (CONVOLVED,)
+        policy = jax.checkpoint_policies.save_only_these_names(*kept)
+        run = jax.checkpoint(run, policy=policy, prevent_cse=False)
 
     def body(state: State, tensor: jax.Array):
         return run(params, state, tensor)
 
     state = initial_state(*tensors.shape[1:4]) if state is None else state
-    return jax.lax.scan(body, state, normalise(tensors))
+    return jax.lax.scan(body, state, normalise(tensors), unroll=one_by_one or 1)
 
 
 def loss_of(params, data: Simulation, state: State | None, warm, settings: StepSettings):
