@@ -312,10 +312,7 @@ def _products(
     f.function.attributes.add("noinline")
     pixels, gradients, sums = f.arguments
 
-    def place(j, c):
-        return 4 * (j * inputs + c) * outputs
-
-    places = [place(j, c) for j in range(3) for c in range(group)]
+    places = [4 * (j * inputs + c) * outputs for j in range(3) for c in range(group)]
     values = [f.load_unaligned(VECTOR, sums, place) for place in places]
 
     def add(x, three, values):

@@ -16,7 +16,7 @@ rounded up to whole tiles, zero wherever there is no pixel of the image.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -95,6 +95,14 @@ PLACES = 2 * COLUMNS.patch  # of two rows
 
 
 BEFORE = {"g1": "g1 before", "g2": "g2 before"}  # states
+
+
+class _Finishing(Function):
+    """With values that what becomes of a convolution's sums may need."""
+
+    exists: Any  # a vector of ones, or of zeros where the window does not exist
+    prediction: Any  # the last layer's weights
+    offset: Any  # and its bias
 
 
 class Layer(NamedTuple):
@@ -270,7 +278,7 @@ def _linear(f: Function, matrix: np.ndarray, values: list) -> list:
 
     results = []
     for i, row in enumerate(matrix):
-        before, after = matrix[i - 1] if i else None, matrix[min(i + 1, len(matrix) - 1)]
+        before, after = matrix[i - 1], matrix[min(i + 1, len(matrix) - 1)]
         if i and np.array_equal(abs(row), abs(before)) and not np.array_equal(row, before):
             continue
         if np.array_equal(abs(row), abs(after)) and not np.array_equal(row, after):
@@ -523,7 +531,7 @@ def _stage(
     restore: list[Code],
 ) -> Code:
     """Four rows of a stage whose weights begin at this byte."""
-    f = Function(module, name, [POINTER, INT, INT])
+    f = _Finishing(module, name, [POINTER, INT, INT])
     pointers, image, part = f.arguments
     arrays = _arrays(f, size, pointers, image)
     transformed = f.alloca(len(stage.sources) * PLACES * size.place)
