@@ -13,7 +13,7 @@ import os
 import zipfile
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -60,7 +60,7 @@ def save_weights(path: str | Path, weights: Weights) -> None:
     path = Path(path)
     if path.suffix != ".npz":
         raise CheckpointError(f"{path}: weights are written as .npz; give it that ending")
-    flat = _flatten(weights.params)
+    flat: dict[str, Any] = _flatten(weights.params)
     _check(path, flat, "cannot be written")
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:

@@ -9,6 +9,7 @@ XLA computes it in a way that takes many times as long as the matrix products be
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -87,7 +88,7 @@ CONVOLVED = "convolved"
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _layer(machine_code: bool, activations, maps, kernel, bias):
+def _layer(machine_code: bool, activations, maps, kernel, bias) -> tuple[jax.Array, ...]:
     def by_machine_code(maps, kernel, bias):
         return tuple(native.convolve(maps, kernel, bias, activations))
 
@@ -108,7 +109,7 @@ def _joined(maps):
     return maps[0] if len(maps) == 1 else jnp.concatenate(maps, -1)
 
 
-def choose(machine_code: bool, *functions_and_arguments):
+def choose(machine_code: bool, *functions_and_arguments) -> Any:
     """As `native.choose`, but the second function where machine code is not wanted."""
     if machine_code:
         return native.choose(*functions_and_arguments)
@@ -122,8 +123,8 @@ def turned(kernel: jax.Array) -> jax.Array:
 
 
 def _forward(machine_code, activations, maps, kernel, bias):
-    results = _layer(machine_code, activations, maps, kernel, bias)
-    results = tuple(checkpoint_name(result, CONVOLVED) for result in results)
+    computed: Any = _layer(machine_code, activations, maps, kernel, bias)
+    results = tuple(checkpoint_name(result, CONVOLVED) for result in computed)
     return results, (maps, kernel, results)
 
 

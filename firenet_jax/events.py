@@ -192,7 +192,7 @@ def checked(
                 rows, last = rows + len(events), events.t[-1]
                 yield events
                 continue
-            bad = np.zeros(len(events), bool) if chunk is events else chunk.bad
+            bad = chunk.bad if isinstance(chunk, Rows) else np.zeros(len(events), bool)
             first, error = _first_error(chunk, path, last, height, width, place, rows)
             bad = bad | _outside(events, height, width)
             fewest = bad | _out_of_order(events.t, bad, last)
@@ -266,11 +266,11 @@ def _first_error(
 ) -> tuple[int, RecordingError]:
     """(the first row of a chunk that cannot be, what is to be said of it); rows: before it"""
     events = chunk if isinstance(chunk, Events) else chunk.events
-    known = np.zeros(len(events), bool) if chunk is events else chunk.bad
+    known = chunk.bad if isinstance(chunk, Rows) else np.zeros(len(events), bool)
     t, x, y = events.t, events.x, events.y
     steps = np.diff(t, prepend=last)
     row = int(np.argmax(known | (steps < 0) | _outside(events, height, width)))
-    if known[row]:
+    if isinstance(chunk, Rows) and known[row]:
         return row, chunk.error
     where = f"{path}, {place(rows + row)}"
     if steps[row] < 0:

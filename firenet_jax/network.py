@@ -65,8 +65,7 @@ class Conv(nn.Module):
 
     def __call__(self, *maps: jax.Array) -> tuple[jax.Array, ...]:
         kernel, bias = self.parameters(sum(x.shape[-1] for x in maps))
-        maps = [x.astype(self.dtype) for x in maps]
-        return layer(maps, kernel, bias, self.activations)
+        return layer([x.astype(self.dtype) for x in maps], kernel, bias, self.activations)
 
 
 class ConvGRU(nn.Module):
@@ -159,7 +158,8 @@ def step(
     tensor must be finite there too: zeros, for instance).
     dtype: of the convolutions; jnp.bfloat16 trades accuracy for speed on accelerators.
     """
-    return FireNet(dtype).apply({"params": params}, state, event_tensor, exists)
+    network: Any = FireNet(dtype)  # flax does not say what `apply` returns
+    return network.apply({"params": params}, state, event_tensor, exists)
 
 
 def initial_params(key: jax.Array):

@@ -78,10 +78,11 @@ def unsharp_mask(images: jax.Array, amount: float) -> jax.Array:
         padding = [(0, 0)] * blurred.ndim
         padding[axis] = (2, 2)
         padded = jnp.pad(blurred, padding)
-        blurred = sum(
+        shifted = (
             float(weight) * jax.lax.slice_in_dim(padded, k, k + size, axis=axis)
             for k, weight in enumerate(_unsharp_weights())
         )
+        blurred = sum(shifted, jnp.zeros_like(images))
     return (1 + amount) * images - amount * blurred
 
 
@@ -137,7 +138,7 @@ def bilateral(images: jax.Array, sigma: float = 25.0) -> jax.Array:
     """
     height, width = images.shape[-2:]
     padded = jnp.pad(images, [(0, 0)] * (images.ndim - 2) + [(2, 2)] * 2, mode="reflect")
-    total, weights = 0.0, 0.0
+    total = weights = jnp.zeros_like(images)
     for i in range(-2, 3):
         for j in range(-2, 3):
             if i**2 + j**2 <= 4:

@@ -105,8 +105,8 @@ def _by_machine_code(recurrent: bool, weights: Weights, state: State, tensors, v
     native_step = partial(native.step, packed, normalise=weights.normalise)
     if len(tensors) == 1:  # not in place: the caller's state stays
         native_step = partial(native_step, in_place=False)
-    state, images = _scan(native_step, recurrent, normalised, tuple(state), tensors, valid)
-    return State(*state), images
+    kept, images = _scan(native_step, recurrent, normalised, tuple(state), tensors, valid)
+    return State(*kept), images
 
 
 def _scan(step, recurrent: bool, weights: Weights, state, tensors, valid):
@@ -220,8 +220,8 @@ class Committed(NamedTuple):
 class Looks(NamedTuple):
     """What T steps of B recordings are, as `instants.steps` says."""
 
-    looks: jax.Array  # (T, B) bool: an image whose new state is thrown away; else it is kept
-    share: jax.Array  # (T, B) float32: of a look, how far from `before` to `last` it begins
+    looks: np.ndarray  # (T, B) bool: an image whose new state is thrown away; else it is kept
+    share: np.ndarray  # (T, B) float32: of a look, how far from `before` to `last` it begins
 
 
 @partial(jax.jit, static_argnames=("recurrent", "dtype", "machine_code"))
@@ -260,9 +260,9 @@ def _at_by_machine_code(recurrent: bool, weights: Weights, committed: Committed,
     packed, normalised = native.pack(weights.params), replace(weights, normalise=False)
     # Not in place: the state that a look begins from is still wanted.
     native_step = partial(native.step, packed, normalise=weights.normalise, in_place=False)
-    committed = Committed(*map(tuple, committed))
-    committed, images = _scan_at(native_step, recurrent, normalised, committed, tensors, *inputs)
-    return Committed(*(State(*state) for state in committed)), images
+    kept = Committed._make(map(tuple, committed))
+    kept, images = _scan_at(native_step, recurrent, normalised, kept, tensors, *inputs)
+    return Committed._make(State(*state) for state in kept), images
 
 
 def _scan_at(step, recurrent: bool, weights: Weights, committed: Committed, tensors, steps, valid):
@@ -379,8 +379,8 @@ def _unfold(channels):
 
 def padding(height: int, width: int, multiple: int) -> tuple[tuple[int, int], tuple[int, int]]:
     """((top, bottom), (left, right)) up to the next multiple; the larger half first (rpg_e2vid)."""
-    missing = (-height % multiple, -width % multiple)
-    return tuple((-(-n // 2), n // 2) for n in missing)
+    rows, columns = -height % multiple, -width % multiple
+    return (-(-rows // 2), rows // 2), (-(-columns // 2), columns // 2)
 
 
 @partial(

@@ -132,7 +132,7 @@ def pack(
 
 
 # How the devices of `pack_for_devices` share its arrays.
-IN_LISTS = Packed(*[BATCH] * 5, t_min=TIME_BATCH, duration=TIME_BATCH)
+IN_LISTS = Packed._make([BATCH] * 5 + [TIME_BATCH] * 2)
 
 
 def pack_for_devices(

@@ -75,10 +75,8 @@ class Windows:
         if self.duration is not None and round(self.duration * 1000) < 1:
             raise ValueError(f"duration is {self.duration} ms, but times are whole microseconds")
 
-    def count(self, pixels: int) -> int | None:
-        """Events in a full window of a sensor with this many pixels; None where time decides."""
-        if self.duration is not None or self.between_frames:
-            return None
+    def count(self, pixels: int) -> int:
+        """Events in a full window of a sensor with this many pixels, unless time decides."""
         if self.events is not None:
             return self.events
         return max(1, round((self.events_per_pixel or 0.35) * pixels))
@@ -243,9 +241,9 @@ def _grid_spans(duration: float, step: float, first: int) -> Iterator[tuple[int,
 
     In fractions: of floats, an end and the next start would round to two microseconds.
     """
-    step, duration = (Fraction(str(value)) * 1000 for value in (step, duration))
+    apart, long = (Fraction(str(value)) * 1000 for value in (step, duration))
     for k in itertools.count():
-        yield first + round(k * step), first + round(k * step + duration)
+        yield first + round(k * apart), first + round(k * apart + long)
 
 
 def _frame_spans(path, times: np.ndarray, first: int) -> Iterator[tuple[int, int]]:

@@ -64,13 +64,12 @@ def run(settings: Export) -> None:
     if settings.web is None and settings.output is None:
         raise OutputError("nothing to write: pass -o and a name such as model.onnx, or --web")
     if settings.web is not None:
-        write_web(settings)
+        write_web(settings.web, settings)
     if settings.output is not None:
-        write_file(settings)
+        write_file(settings.output, settings)
 
 
-def write_web(settings: Export) -> None:
-    folder = settings.web
+def write_web(folder: Path, settings: Export) -> None:
     if folder.exists() and not settings.overwrite and any(folder.iterdir()):
         raise OutputError(f"{folder} exists; choose another name or pass --overwrite")
     version = runtime_version(settings.runtime)
@@ -104,8 +103,7 @@ def simulated(height: int, width: int, seconds: float) -> Iterator[Events]:
     return event_list(sensor, video(scene, times, height=height, width=width))
 
 
-def write_file(settings: Export) -> None:
-    path = settings.output
+def write_file(path: Path, settings: Export) -> None:
     if path.suffix not in KINDS:
         raise OutputError(f"{path}: cannot write {path.suffix or 'such'} files; try {KINDS}")
     runs = path.suffix in (".onnx", ".stablehlo")

@@ -50,7 +50,7 @@ def describe(
     recording = open_recording(path, sensor_size, strict, columns)
     windows = usual(until_damage(recording.events()))
     counts = np.zeros(recording.pixels, np.int64)
-    on = first = last = None
+    on, first, last = 0, None, 0
     read = Bytes([path] if recording.count is None else [])
     progress = bar(recording.count or read.total, "B" if read.total else "ev", unit_scale=True)
 
@@ -59,7 +59,7 @@ def describe(
         for chunk in recording.events():
             pixels = chunk.y.astype(np.int64) * recording.width + chunk.x
             counts += np.bincount(pixels, minlength=counts.size)
-            on = (on or 0) + int(chunk.p.sum())
+            on += int(chunk.p.sum())
             first = int(chunk.t[0]) if first is None else first
             last = int(chunk.t[-1])
             progress.update(read.read() - progress.n if read.total else len(chunk))
@@ -68,7 +68,7 @@ def describe(
     with progress:
         pictures = sum(1 for _ in cut(recording, windows, events()))
     total = int(counts.sum())
-    if total == 0:
+    if first is None:
         raise RecordingError(
             f"{path}: holds no events: check that it was recorded and copied whole"
         )

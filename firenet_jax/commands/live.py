@@ -132,12 +132,11 @@ def run(settings: Live) -> None:
     print(f"{source.name}, {size}: open {address} to watch, Ctrl-C ends", flush=True)
     count = Windows(events_per_pixel=settings.events_per_pixel).count(source.height * source.width)
     begun = time.monotonic()
-    if settings.seconds is not None:
-        source = source._replace(
-            arrivals=itertools.takewhile(
-                lambda _: time.monotonic() - begun < settings.seconds, source.arrivals
-            )
+    if (seconds := settings.seconds) is not None:
+        arrivals = itertools.takewhile(
+            lambda _: time.monotonic() - begun < seconds, source.arrivals
         )
+        source = source._replace(arrivals=arrivals)
     limits = Limits(count, round(1000 * settings.longest), settings.behind)
     shown = pictures(source, weights, limits, figures, settings.display)
     try:

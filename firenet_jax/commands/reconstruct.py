@@ -331,8 +331,9 @@ def windows_for(recording: Recording, settings: Reconstruct) -> tuple[Windows, f
             windows = usual(until_damage(part_of(recording, settings)))
         except RecordingError:  # told when its events are read, so that others are done
             windows = Windows(longest=LONGEST)
-        if settings.speed is None and windows.longest < LONGEST / 2:  # gone in 0.4 s
-            speed = windows.longest / LONGEST
+        longest = windows.longest or LONGEST
+        if settings.speed is None and longest < LONGEST / 2:  # gone in 0.4 s
+            speed = longest / LONGEST
     return windows, speed
 
 
@@ -647,7 +648,7 @@ def start(job: Job, settings: Reconstruct, writers: dict[Path, Writer]) -> tuple
     except RecordingError:
         writers.pop(job.output).abandon()
         raise
-    if done:
+    if done and isinstance(writer, FolderWriter):
         writer.keep(pictures)
         events.clear()  # those of the pictures that are there
     return Running(job, entries, first, done, pictures, events, writer, counts), session
@@ -739,9 +740,9 @@ def keep_position(part: Part, session: Session) -> None:
 
 def publish_position(part: Part) -> None:
     """The part's pictures are written: if its state was kept, a new run goes on from there."""
-    path = kept_file(part)
-    if path.exists():
-        part.running.writer.flush()
+    path, writer = kept_file(part), part.running.writer
+    if path.exists() and isinstance(writer, FolderWriter):
+        writer.flush()
         os.replace(path, position_file(part.running.job))
 
 

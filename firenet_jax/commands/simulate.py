@@ -34,6 +34,7 @@ import h5py
 import jax
 import numpy as np
 import tyro
+from av.error import FFmpegError
 
 from firenet_jax.devices import share
 from firenet_jax.errors import OutputError, PictureError, SettingsError
@@ -617,7 +618,10 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
             stream.thread_type = "AUTO"
             period = 1 / (stream.average_rate or Fraction(25))
             for number, frame in enumerate(container.decode(stream)):
-                seconds = number * period if frame.pts is None else frame.pts * frame.time_base
+                if frame.pts is None or frame.time_base is None:
+                    seconds = number * period
+                else:
+                    seconds = frame.pts * frame.time_base
                 first = seconds if first is None else first
                 time = round((seconds - first) * 1_000_000)
                 if last is not None and not 0 < time - last <= LONGEST:
@@ -632,7 +636,7 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
                 rgb = frame.to_ndarray(format="rgb24", width=width, height=height)
                 grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
                 yield Picture(time, np.round(grey).astype(np.uint8), None)
-    except (av.FFmpegError, OSError, UnicodeDecodeError) as error:  # names in it that are no text
+    except (FFmpegError, OSError, UnicodeDecodeError) as error:  # names in it that are no text
         reason = getattr(error, "strerror", None) or error
         raise PictureError(
             f"{path}: cannot be read as a video ({reason}): name a file that ffmpeg can play"

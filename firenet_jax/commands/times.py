@@ -110,9 +110,9 @@ def times_of(
                 f"{recording.path}: has no frames whose times could be taken: use --rate or --at"
             )
         return np.unique(np.asarray(recording.frames.times, np.int64))
-    if wanted.triggers:
-        return _triggers(wanted, recording)
-    return _from_file(wanted, recording, chunks)
+    if wanted.at is not None:
+        return _from_file(wanted.at, wanted, recording, chunks)
+    return _triggers(wanted, recording)
 
 
 def _triggers(wanted: Times, recording: Recording) -> np.ndarray:
@@ -140,8 +140,10 @@ def _triggers(wanted: Times, recording: Recording) -> np.ndarray:
 # ---- A file of times
 
 
-def _from_file(wanted: Times, recording: Recording, chunks: Iterable[Events]) -> np.ndarray:
-    numbers, unit, since_start = read_times(wanted.at)
+def _from_file(
+    path: Path, wanted: Times, recording: Recording, chunks: Iterable[Events]
+) -> np.ndarray:
+    numbers, unit, since_start = read_times(path)
     unit = wanted.unit or unit
     since_start = since_start if wanted.since is None else wanted.since == "start"
     units = [unit] if unit else ["us", "ns", "s"]
@@ -152,25 +154,24 @@ def _from_file(wanted: Times, recording: Recording, chunks: Iterable[Events]) ->
     if first is None:
         raise RecordingError(f"{recording.path}: no events, or none that the filters let pass")
 
-    best = None
+    found = []
     for name in units:
-        scaled = _scaled(wanted.at, numbers, name)
+        scaled = _scaled(path, numbers, name)
         for relative in origins:
             times = scaled + first if relative else scaled
             inside = int(((times >= first) & (times <= last)).sum())
-            if best is None or inside > best[0]:
-                best = inside, times, name, relative
-    inside, times, name, relative = best
+            found.append((inside, times, name, relative))
+    inside, times, name, relative = max(found, key=lambda one: one[0])  # of equals the first
     if len(units) * len(origins) > 1:
         if not inside:
             raise RecordingError(
-                f"{wanted.at}: none of its {counted(len(times), 'time')} lies within the "
+                f"{path}: none of its {counted(len(times), 'time')} lies within the "
                 f"recording, {first / 1e6:.6f} to {last / 1e6:.6f} s: name the unit with --unit, "
                 "and with --since start that they count from the first event"
             )
         logger.warning(
             "%s: its %s are taken as %s, %s (--unit and --since say it otherwise)",
-            wanted.at, counted(len(times), "time"), NAMES[name],
+            path, counted(len(times), "time"), NAMES[name],
             "since the first event" if relative else "on the recording's clock",
         )  # fmt: skip
     return np.unique(times)

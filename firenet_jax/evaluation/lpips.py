@@ -52,7 +52,7 @@ def lpips(weights: Lpips, images: jax.Array, truths: jax.Array) -> jax.Array:
     if min(images.shape[-2:]) < SMALLEST:
         size = f"{SMALLEST}x{SMALLEST}"
         raise SettingsError(f"LPIPS needs {size} pixels at least, not {images.shape[-2:]}")
-    distance = 0.0
+    distance = jnp.float32(0)
     both = _features(weights, jnp.stack([images, truths]))
     for linear, features in zip(weights.linear, both, strict=True):
         ours, theirs = jnp.split(_unit(features), 2)

@@ -19,6 +19,7 @@ other and computes it again for each tap, and convolutions of one channel take 3
 
 import math
 from functools import partial
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +28,10 @@ import numpy as np
 from firenet_jax.errors import SettingsError
 from firenet_jax.warp import warp
 
+Border = Literal["valid", "symmetric", "constant", "edge"]
 
-def _matrix(size: int, weights, border: str = "valid", stride: int = 1) -> np.ndarray:
+
+def _matrix(size: int, weights, border: Border = "valid", stride: int = 1) -> np.ndarray:
     """(outputs, size) float32: the matrix that correlates `size` pixels with the weights.
 
     border: "valid" keeps the places where all weights meet a pixel; other names are modes of
@@ -41,7 +44,8 @@ def _matrix(size: int, weights, border: str = "valid", stride: int = 1) -> np.nd
     outputs = len(padded) - taps + 1
     if outputs < 1:
         raise SettingsError(f"a side of {size} pixels is too small for a filter of {taps}")
-    matrix = sum(weight * padded[k : k + outputs] for k, weight in enumerate(weights))
+    shifted = (weight * padded[k : k + outputs] for k, weight in enumerate(weights))
+    matrix = sum(shifted, np.zeros((outputs, size)))
     return matrix[::stride].astype(np.float32)
 
 
@@ -51,7 +55,7 @@ def _apply(image: jax.Array, rows: np.ndarray, columns: np.ndarray) -> jax.Array
     return jnp.einsum("...hw,jw->...hj", image, columns, precision="highest")
 
 
-def _filter(image: jax.Array, down, across, border: str = "valid", stride: int = 1) -> jax.Array:
+def _filter(image: jax.Array, down, across, border: Border = "valid", stride: int = 1) -> jax.Array:
     """Correlates the image with the outer product of two lists of weights."""
     height, width = image.shape[-2:]
     return _apply(
@@ -331,13 +335,15 @@ def nlpd(image: jax.Array, truth: jax.Array) -> jax.Array:
     if blurred by 1.5 pixels, 0.5 with noise of 0.1, 1.5 for a flat image and 3 for a negative.
     """
     image, truth = _compared(image, truth)
-    distance = 0.0
+    distance = jnp.float32(0)
     for band in range(len(NLPD_BANDS)):
         last = band == len(NLPD_BANDS) - 1
         details = []
         for picture in (image, truth):
-            smaller = None if last else _filter(picture, PYRAMID, PYRAMID, "symmetric", stride=2)
-            detail = picture if last else picture - _enlarged(smaller, *picture.shape[-2:])
+            detail, smaller = picture, picture
+            if not last:
+                smaller = _filter(picture, PYRAMID, PYRAMID, "symmetric", stride=2)
+                detail = picture - _enlarged(smaller, *picture.shape[-2:])
             details.append((_divided(detail, band), smaller))
         (of_image, image), (of_truth, truth) = details
         distance += _root(_mean((of_image - of_truth) ** 2))
@@ -394,7 +400,7 @@ def detail(image: jax.Array, truth: jax.Array) -> jax.Array:
             picture = smooth
 
     pairs = zip(bands(image), bands(truth), strict=True)
-    return sum(_mean(jnp.abs(a - b)) for a, b in pairs) / len(DETAIL)
+    return sum((_mean(jnp.abs(a - b)) for a, b in pairs), jnp.float32(0)) / len(DETAIL)
 
 
 @jax.jit
@@ -409,7 +415,7 @@ def cw_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     """
     image, truth = _compared(image, truth)
     scales = max(1, sum(min(image.shape[-2:]) >> scale >= 17 for scale in range(3)))
-    similarity = 0.0
+    similarity = jnp.float32(0)
     for scale in range(scales):
         if scale:
             image, truth = _halved(image), _halved(truth)
@@ -442,7 +448,7 @@ def _gabor(image: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
 
 def _complex_similarity(a: list, b: list) -> jax.Array:
     box, constant = np.ones(4) / 4, 0.01**2
-    similarity = 0.0
+    similarity = jnp.float32(0)
     for (a_real, a_imaginary), (b_real, b_imaginary) in zip(a, b, strict=True):
         real = _filter(a_real * b_real + a_imaginary * b_imaginary, box, box)
         imaginary = _filter(a_imaginary * b_real - a_real * b_imaginary, box, box)
@@ -463,9 +469,9 @@ def random_features(image: jax.Array, truth: jax.Array, *, seed: int = 0) -> jax
     seed: another one is another distance; compare only numbers of the same.
     """
     kernels = random_kernels(seed)
-    image, truth = (_random_layers(kernels, picture) for picture in _compared(image, truth))
-    layers = [_mean(((a - b) ** 2).sum(-1)) for a, b in zip(image, truth, strict=True)]
-    return sum(layers) / len(layers)
+    both = (_random_layers(kernels, picture) for picture in _compared(image, truth))
+    layers = [_mean(((a - b) ** 2).sum(-1)) for a, b in zip(*both, strict=True)]
+    return sum(layers, jnp.float32(0)) / len(layers)
 
 
 def random_kernels(seed: int) -> list[np.ndarray]:
@@ -488,7 +494,7 @@ def _random_layers(kernels: list[np.ndarray], image: jax.Array) -> list[jax.Arra
             x = _blocks(x).mean(3)
         x = jax.lax.conv_general_dilated(
             x,
-            kernel,
+            jnp.asarray(kernel),
             window_strides=(1, 1),
             padding="SAME",
             dimension_numbers=("NHWC", "HWIO", "NHWC"),

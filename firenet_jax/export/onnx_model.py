@@ -34,11 +34,12 @@ class _Graph:
         self.constants[name] = self.numpy_helper.from_array(array, name)
         return name
 
-    def add(self, operator: str, *inputs: str, out: str | list[str], **attributes):
-        """One node; returns the name, or names, of what it gives."""
-        outputs = [out] if isinstance(out, str) else out
-        name = outputs[0]
-        node = self.helper.make_node(operator, list(inputs), outputs, name=name, **attributes)
+    def add(self, operator: str, *inputs: str, out: str, **attributes) -> str:
+        """One node; returns the name of what it gives."""
+        return self.add_several(operator, *inputs, out=[out], **attributes)[0]
+
+    def add_several(self, operator: str, *inputs: str, out: list[str], **attributes) -> list[str]:
+        node = self.helper.make_node(operator, list(inputs), out, name=out[0], **attributes)
         self.nodes.append(node)
         return out
 
@@ -118,7 +119,8 @@ def _gru(graph: _Graph, name: str, layers: dict, h: str, x: str, out: str) -> st
         "Sigmoid", graph.convolve(both, layers["gates"], f"{name}.gates"), out=f"{name}.sigmoid"
     )
     sizes = graph.constant("channels", np.array([CHANNELS, CHANNELS], np.int64))
-    r, z = graph.add("Split", gates, sizes, out=[f"{name}.reset", f"{name}.update"], axis=1)
+    halves = [f"{name}.reset", f"{name}.update"]
+    r, z = graph.add_several("Split", gates, sizes, out=halves, axis=1)
     reset = graph.add("Mul", r, h, out=f"{name}.kept")
     both = graph.add("Concat", x, reset, out=f"{name}.both_reset", axis=1)
     q = graph.add(

@@ -12,6 +12,7 @@ import importlib.resources
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -58,7 +59,7 @@ def write_page(folder: Path, weights: Weights, sample: Events, height: int, widt
         for page in importlib.resources.files("firenet_jax.export").joinpath("page").iterdir():
             (folder / page.name).write_bytes(page.read_bytes())
         (folder / "firenet.onnx").write_bytes(model)
-        columns = {"t": sample.t, "x": sample.x, "y": sample.y, "p": sample.p}
+        columns: dict[str, Any] = {"t": sample.t, "x": sample.x, "y": sample.y, "p": sample.p}
         np.savez_compressed(folder / "sample.npz", **columns, width=width, height=height)
         for name in FILES:
             shutil.copyfile(runtime / "dist" / name, folder / "ort" / name)

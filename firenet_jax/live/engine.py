@@ -9,7 +9,7 @@ to its picture.
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -177,7 +177,7 @@ def pictures(
     limits: Limits,
     figures: Figures,
     settings: Display = Display(),
-) -> Iterator[np.ndarray]:
+) -> Generator[np.ndarray, None, None]:
     """A source -> pictures (H, 2 W, 3) uint8, the events beside the reconstruction.
 
     figures: what is measured is noted down there.

@@ -12,13 +12,15 @@ converters and camera programs can feed this one; text is what everything can wr
 """
 
 import contextlib
+import importlib
+import io
 import select
 import socket
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -125,7 +127,7 @@ def tcp(host: str, port: int) -> Iterator[bytes]:
 
 def standard_input() -> Iterator[bytes]:
     """What is piped into this program, until its end."""
-    pipe = sys.stdin.buffer
+    pipe = cast(io.BufferedReader, sys.stdin.buffer)
     if not hasattr(select, "poll"):  # Windows: pipes cannot be asked, so this may wait
         while piece := pipe.read1(PIECE):
             yield piece
@@ -179,7 +181,7 @@ class _Binary:
         size = self.kind.itemsize
         whole = len(data) // size * size
         rows = np.frombuffer(data[:whole], self.kind)
-        if "on" in self.kind.names:
+        if "on" in (self.kind.names or ()):
             # A time that int64 cannot hold is nonsense, and left out as one before all others.
             t = np.where(rows["t"] < 2**62, rows["t"], 0).astype(np.int64)
             y, on = rows["y"], rows["on"] != 0
@@ -222,7 +224,7 @@ def _text(data: bytes) -> tuple[Events, bytes]:
 def camera() -> Source:
     """The first camera that is plugged in, by neuromorphic_drivers (Prophesee, iniVation)."""
     try:
-        import neuromorphic_drivers as drivers
+        drivers = importlib.import_module("neuromorphic_drivers")
     except ImportError as error:
         raise RecordingError(
             "a camera needs its drivers: pip install neuromorphic_drivers, or send its events by "

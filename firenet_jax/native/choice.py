@@ -13,6 +13,7 @@ from functools import partial
 from threading import RLock
 
 import jax
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
@@ -35,7 +36,7 @@ def choose(machine_code: Callable, xla: Callable, *arguments):
     def flat(function):
         return lambda *leaves: jax.tree.leaves(function(*tree.unflatten(leaves)))
 
-    avals = tuple(jax.core.ShapedArray(result.shape, result.dtype) for result in results)
+    avals = tuple(ShapedArray(result.shape, result.dtype) for result in results)
     functions = {"machine_code": flat(machine_code), "xla": flat(xla)}
     return result_tree.unflatten(_choice.bind(*leaves, **functions, results=avals))
 
@@ -59,7 +60,7 @@ def _batched(arguments, axes, *, machine_code, xla, results):
     mapped = {
         "machine_code": jax.vmap(machine_code, axes, axis_size=size),
         "xla": jax.vmap(xla, axes, axis_size=size),
-        "results": tuple(jax.core.ShapedArray((size, *r.shape), r.dtype) for r in results),
+        "results": tuple(ShapedArray((size, *r.shape), r.dtype) for r in results),
     }
     return _choice.bind(*arguments, **mapped), [0] * len(results)
 

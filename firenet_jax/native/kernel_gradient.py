@@ -81,10 +81,7 @@ def _products(
     f.function.attributes.add("noinline")
     pixels, gradients, sums = f.arguments
 
-    def place(j, c):
-        return 4 * (j * inputs + c) * outputs
-
-    places = [place(j, c) for j in range(3) for c in range(group)]
+    places = [4 * (j * inputs + c) * outputs for j in range(3) for c in range(group)]
     values = [f.load_unaligned(VECTOR, sums, place) for place in places]
 
     def add(x, three, values):
@@ -129,7 +126,8 @@ def _begin(module: Module, height: int, width: int, maps: tuple, gradients: tupl
 
 
 def _biases(f: Function, there: list, gradients: tuple, rows: tuple, width: int, target) -> None:
-    """Sums of each channel of the gradients over some rows."""
+    """Sums of each channel of the gradients over some rows, from the first to before the last."""
+    first, last = rows
     column = 0
     for gradient, channels in zip(there, gradients, strict=True):
         for lane in range(0, 4 * channels, VECTOR_BYTES):
@@ -143,7 +141,7 @@ def _biases(f: Function, there: list, gradients: tuple, rows: tuple, width: int,
 
                 return f.loop(0, width, add, total)
 
-            f.store_unaligned(f.loop(*rows, of_row, [vector(0)])[0], target, column + lane)
+            f.store_unaligned(f.loop(first, last, of_row, [vector(0)])[0], target, column + lane)
         column += 4 * channels
 
 
@@ -152,11 +150,11 @@ def _by_winograd(module: Module, height: int, width: int, maps: tuple, gradients
     f, sources, there, partial = _begin(module, height, width, maps, gradients)
     size, inputs, outputs = Tiling(height, width), sum(maps), sum(gradients)
     _, _, part = f.arguments
-    of_maps, of_gradients = (
-        [write(module, size, rows) for rows in GROUPS] for write in (transform, spread)
-    )
+    of_maps = [transform(module, size, rows) for rows in GROUPS]
+    of_gradients = [spread(module, size, rows) for rows in GROUPS]
     products = outer(module, size, inputs, outputs)
-    patches = [size.patch] * len(maps) + [(ROWS.tile, COLUMNS.tile * size.block)] * len(gradients)
+    tiles = ROWS.tile, COLUMNS.tile * size.block
+    patches = [size.patch] * len(maps) + [tiles] * len(gradients)
     rooms = [f.alloca(rows * columns * PIXEL) for rows, columns in patches]
     each = PLACES * size.place
     transformed, changes = (f.alloca(each * len(arrays)) for arrays in (maps, gradients))
@@ -184,13 +182,13 @@ def _by_winograd(module: Module, height: int, width: int, maps: tuple, gradients
                     f.b.call(products, [f.at(transformed, m * each), f.at(changes, g * each), sums])
 
     first, last = f.rows(part, PART, height)
-    tiles = f.b.sdiv(f.b.add(last, integer(ROWS.tile - 1)), integer(ROWS.tile))
+    end = f.b.sdiv(f.b.add(last, integer(ROWS.tile - 1)), integer(ROWS.tile))
 
     def row_of_tiles(y, _):
         top = f.times(y, ROWS.tile)
         f.loop(0, -(-size.across // size.block), lambda i, _: block(top, i))
 
-    f.loop(f.b.sdiv(first, integer(ROWS.tile)), tiles, row_of_tiles)
+    f.loop(f.b.sdiv(first, integer(ROWS.tile)), end, row_of_tiles)
     biases = f.at(partial, 4 * len(GROUPS) * PLACES * inputs * outputs)
     _biases(f, there, gradients, (first, last), width, biases)
     f.b.ret_void()

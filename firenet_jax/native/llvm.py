@@ -8,6 +8,7 @@ channels; LLVM makes of them what the processor has.
 import sys
 from collections.abc import Callable
 from math import factorial
+from typing import Any, cast
 
 import numpy as np
 from llvmlite import binding, ir
@@ -24,14 +25,17 @@ LN2 = float(np.log(2))
 # (e^r - 1 - r) / r^2 as a polynomial, to 1e-8 where |r| is at most half of ln 2.
 EXP = (
     Chebyshev.interpolate(
-        lambda r: sum(r**k / factorial(k + 2) for k in range(12)), 4, (-LN2 / 2, LN2 / 2)
+        lambda r: sum((r**k / factorial(k + 2) for k in range(12)), np.zeros_like(r)),
+        4,
+        (-LN2 / 2, LN2 / 2),
     )
     .convert(kind=Polynomial)
     .coef
 )
 
 VOID, NULL = ir.VoidType(), ir.Constant(POINTER, None)
-Module, Code = ir.Module, ir.Function  # of LLVM
+Module = ir.Module
+Code = ir.Function  # of LLVM
 # LLVM needs a function's type to call it; llvmlite has none for a pointer that was loaded.
 CALL_POINTER = """
 define ptr @call(ptr %function, ptr %argument) {
@@ -109,7 +113,7 @@ class Function:
     def alloca(self, size: int):
         """So many bytes that last until the function returns."""
         with self.b.goto_entry_block():
-            memory = self.b.alloca(VECTOR, -(-size // VECTOR_BYTES))
+            memory: Any = self.b.alloca(VECTOR, -(-size // VECTOR_BYTES))
             memory.align = VECTOR_BYTES
             return self.b.inttoptr(self.b.ptrtoint(memory, INT), POINTER)
 
@@ -148,7 +152,7 @@ class Function:
         value = bytearray(characters.encode() + b"\0")
         constant = ir.Constant(ir.ArrayType(INT8, len(value)), value)
         name = self.module.get_unique_name("text")
-        variable = ir.GlobalVariable(self.module, constant.type, name)
+        variable: Any = ir.GlobalVariable(self.module, constant.type, name)
         variable.linkage, variable.global_constant = "internal", True
         variable.initializer = constant
         return self.b.ptrtoint(variable, INT)
@@ -249,8 +253,8 @@ class Function:
 
     def sigmoid(self, x):
         """1 / (1 + e^-x). "arcp": by an estimate and a Newton step, a division takes longer."""
-        one = vector(1)
-        return self.b.fdiv(one, self.b.fadd(one, self.exp(self.b.fneg(x))), flags=("arcp",))
+        one, b = vector(1), cast(Any, self.b)  # its types do not know flags
+        return b.fdiv(one, b.fadd(one, self.exp(b.fneg(x))), flags=("arcp",))
 
     def tanh(self, x):
         return self.fma(vector(2), self.sigmoid(self.b.fadd(x, x)), vector(-1))

@@ -10,7 +10,7 @@ there is no pixel of the image.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +50,14 @@ CHANNELS, BINS = LANES, 5  # the network's; in steps the 5 become 8
 
 
 BEFORE = {"g1": "g1 before", "g2": "g2 before"}  # states
+
+
+class _Finishing(Function):
+    """With values that what becomes of a convolution's sums may need."""
+
+    exists: Any  # a vector of ones, or of zeros where the window does not exist
+    prediction: Any  # the last layer's weights
+    offset: Any  # and its bias
 
 
 class Layer(NamedTuple):
@@ -320,7 +328,7 @@ def _stage(
     convolutions: Block,
 ) -> Code:
     """Four rows of a stage whose weights begin at this byte."""
-    f = Function(module, name, [POINTER, INT, INT])
+    f = _Finishing(module, name, [POINTER, INT, INT])
     pointers, image, part = f.arguments
     arrays = _arrays(f, size, pointers, image)
     memory = convolutions.memory(f, len(stage.sources), len(stage.layers))

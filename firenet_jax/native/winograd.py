@@ -145,7 +145,7 @@ def _linear(f: Function, matrix: np.ndarray, values: list) -> list:
 
     results = []
     for i, row in enumerate(matrix):
-        before, after = matrix[i - 1] if i else None, matrix[min(i + 1, len(matrix) - 1)]
+        before, after = matrix[i - 1], matrix[min(i + 1, len(matrix) - 1)]
         if i and np.array_equal(abs(row), abs(before)) and not np.array_equal(row, before):
             continue
         if np.array_equal(abs(row), abs(after)) and not np.array_equal(row, after):

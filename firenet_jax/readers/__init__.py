@@ -170,13 +170,13 @@ def _infer_size(path: Path, events: Iterator[Events]) -> tuple[int, int]:
     return height, width
 
 
-def in_chunks(read: Callable[[slice], Events], count: int) -> Iterator[Events]:
+def in_chunks(read: Callable[[slice], Events | Rows], count: int) -> Iterator[Events | Rows]:
     """Random access -> chunks: for formats whose rows can be sliced."""
     for start in range(0, count, CHUNK):
         yield read(slice(start, min(start + CHUNK, count)))
 
 
-def joined(chunks: Iterable[Events], least: int = CHUNK // 4) -> Iterator[Events]:
+def joined(chunks: Iterable[Events | Rows], least: int = CHUNK // 4) -> Iterator[Events | Rows]:
     """Tiny chunks -> chunks of at least so many events: for formats made of packets."""
     waiting, count, damage = [], 0, None
     try:
@@ -194,7 +194,7 @@ def joined(chunks: Iterable[Events], least: int = CHUNK // 4) -> Iterator[Events
         raise damage
 
 
-def all_triggers(pieces: Iterable[tuple], *errors: type[BaseException]) -> Triggers | None:
+def all_triggers(pieces: Iterable[Iterable], *errors: type[BaseException]) -> Triggers | None:
     """Pieces of (times, ids, polarity) -> all of them, up to one of these errors."""
     columns = [[], [], []]
     try:
@@ -223,7 +223,7 @@ def frame_times(path: Path, times: np.ndarray) -> np.ndarray:
 
 
 def to_events(
-    path: Path, row: int, t, x, y, p, place: Callable[[int], str] = event_number
+    path: Path, row: int, t, x, y, p, *, place: Callable[[int], str] = event_number
 ) -> Events | Rows:
     """Columns as a file holds them -> Events; Rows where some hold what events cannot, with an
     error that names the first of them, for `events.checked` to judge.

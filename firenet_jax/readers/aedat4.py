@@ -44,6 +44,7 @@ EVENT = np.dtype(
 CHANNELS = {0: 1, 16: 3, 24: 4}  # OpenCV's numbers for grey, BGR, BGRA of 8 bits
 # kinds: (input, whether the edge rises); a pulse counts as a rising edge, the output as input 1
 EDGES = {1: (0, 1), 2: (0, 0), 3: (0, 1), 4: (1, 1), 5: (1, 0)}
+NOWHERE = -1  # where a field points to that is not there
 DAMAGED = struct.error, ValueError, IndexError, OSError  # what damaged bytes raise here
 
 
@@ -66,13 +67,14 @@ def matches(path: Path) -> bool:
 
 def read(path: Path) -> Source:
     layout = _layout(path)
-    frames = _frames(path, layout)
+    frames, stream = _frames(path, layout), layout.frames
+    shown_grey = frames is not None and stream is not None and _is_grey(path, layout, stream)
     return Source(
         "AEDAT4",
         lambda: joined(_events(path, layout)),
         layout.size,
         frames=frames,
-        grey=layout.explorer or (frames is not None and _is_grey(path, layout)),
+        grey=layout.explorer or shown_grey,
         triggers=lambda: _triggers(path, layout),
     )
 
@@ -91,7 +93,7 @@ def _root(data: bytes, start: int = 0) -> int:
     return start + _number(data, start, "I")
 
 
-def _field(data: bytes, table: int, number: int, kind: str, default: int | None = None):
+def _field(data: bytes, table: int, number: int, kind: str, default: int = 0) -> int:
     """A number of a table; with the kind "at" the place that it points to."""
     entries = table - _number(data, table, "i")
     offset = 0
@@ -129,9 +131,9 @@ def _layout(path: Path) -> Layout:
                 raise ValueError(f"of {size} bytes")
             header, begin = file.read(size), file.tell()
             table = _root(header)
-            codec = _field(header, table, 0, "i", 0)
+            codec = _field(header, table, 0, "i")
             end = _field(header, table, 1, "q", -1)
-            start, count = _vector(header, _field(header, table, 2, "at", -1), 1)
+            start, count = _vector(header, _field(header, table, 2, "at", NOWHERE), 1)
             streams = _streams(header[start : start + count])
         except (*DAMAGED, ElementTree.ParseError) as error:
             raise RecordingError(f"{damaged} ({error}): {remedy}") from error
@@ -165,8 +167,8 @@ def _streams(text: bytes) -> dict[int, tuple[str, tuple[int, int] | None]]:
         if "typeIdentifier" not in said:
             continue
         inside = {attribute.get("key"): attribute.text for attribute in node.iter("attr")}
-        sides = inside.get("sizeY"), inside.get("sizeX")
-        size = (int(sides[0]), int(sides[1])) if all(sides) else None
+        height, width = inside.get("sizeY"), inside.get("sizeX")
+        size = (int(height), int(width)) if height and width else None
         found[int(node.get("name") or -1)] = said["typeIdentifier"], size
     return found
 
@@ -216,8 +218,8 @@ def _events(path: Path, layout: Layout) -> Iterator[Events | Rows]:
         for place, size in _packets(path, file, layout, layout.events):
             with reading(path, *DAMAGED):
                 data = _unpacked(file, layout, place, size)
-                start = _field(data, _root(data), 0, "at")
-                if start is None:  # a packet of nothing
+                start = _field(data, _root(data), 0, "at", NOWHERE)
+                if start == NOWHERE:  # a packet of nothing
                     continue
                 start, count = _vector(data, start, EVENT.itemsize)
                 events = np.frombuffer(data, EVENT, count, start)
@@ -227,20 +229,20 @@ def _events(path: Path, layout: Layout) -> Iterator[Events | Rows]:
 
 
 def _triggers(path: Path, layout: Layout) -> Triggers | None:
-    def pieces():
+    def pieces(stream: int):
         with open(path, "rb") as file:
-            for place, size in _packets(path, file, layout, layout.triggers):
+            for place, size in _packets(path, file, layout, stream):
                 data = _unpacked(file, layout, place, size)
-                start = _field(data, _root(data), 0, "at")
-                start, count = (0, 0) if start is None else _vector(data, start, 4)
+                start = _field(data, _root(data), 0, "at", NOWHERE)
+                start, count = (0, 0) if start == NOWHERE else _vector(data, start, 4)
                 edges = []
                 for at in range(start, start + 4 * count, 4):
                     table = _root(data, at)
-                    if (kind := _field(data, table, 1, "b", 0)) in EDGES:
-                        edges.append((_field(data, table, 0, "q", 0), *EDGES[kind]))
+                    if (kind := _field(data, table, 1, "b")) in EDGES:
+                        edges.append((_field(data, table, 0, "q"), *EDGES[kind]))
                 yield np.array(edges, np.int64).reshape(-1, 3).T
 
-    return None if layout.triggers is None else all_triggers(pieces(), *DAMAGED)
+    return None if layout.triggers is None else all_triggers(pieces(layout.triggers), *DAMAGED)
 
 
 # ---- Frames
@@ -264,29 +266,29 @@ def _frames(path: Path, layout: Layout) -> Frames | None:
     return Frames(times, lambda i: _frame(path, layout, places[i]))
 
 
-def _is_grey(path: Path, layout: Layout) -> bool:
+def _is_grey(path: Path, layout: Layout, stream: int) -> bool:
     """Whether the first frame has one channel: cameras with a mosaic write colours."""
     with open(path, "rb") as file:
-        place, size = next(_packets(path, file, layout, layout.frames))
+        place, size = next(_packets(path, file, layout, stream))
         data = _unpacked(file, layout, place, size, HEAD)
-    return _field(data, _root(data), 5, "b", 0) == 0
+    return _field(data, _root(data), 5, "b") == 0
 
 
 def _time(data: bytes) -> int:
     table = _root(data)
-    begin, end = (_field(data, table, number, "q", 0) for number in (3, 4))
-    return (begin + end) // 2 if begin and end else _field(data, table, 0, "q", 0)
+    begin, end = (_field(data, table, number, "q") for number in (3, 4))
+    return (begin + end) // 2 if begin and end else _field(data, table, 0, "q")
 
 
 def _frame(path: Path, layout: Layout, packet: tuple[int, int]) -> np.ndarray:
     with open(path, "rb") as file, reading(path, *DAMAGED):
         data = _unpacked(file, layout, *packet)
         table = _root(data)
-        kind = _field(data, table, 5, "b", 0)
-        width, height = (_field(data, table, number, "h", 0) for number in (6, 7))
+        kind = _field(data, table, 5, "b")
+        width, height = (_field(data, table, number, "h") for number in (6, 7))
         if kind not in CHANNELS:
             raise ValueError(f"a frame of format {kind}")
-        start, count = _vector(data, _field(data, table, 10, "at", -1), 1)
+        start, count = _vector(data, _field(data, table, 10, "at", NOWHERE), 1)
         shape = height, width, CHANNELS[kind]
         if min(height, width) < 1 or count != height * width * CHANNELS[kind]:
             raise ValueError(f"a frame of {width}x{height} in {count} bytes")

@@ -33,7 +33,7 @@ def read(path: Path) -> Source:
     if path.is_dir():
         source = text.read(path / "events.txt")
     else:
-        source = text.read(path, _folder_in(path) + "events.txt")
+        source = text.read(path, f"{_folder_in(path)}events.txt")
     frames = _frames(path)
     size = frames.read(0).shape if frames and source.size is None else source.size
     return replace(
@@ -59,7 +59,7 @@ def _folder_in(path: Path) -> str | None:
 def _bytes(path: Path, name: str) -> bytes:
     """Of a list or a picture: neither is so large that it would have to be read in parts."""
     inside = open(path / name, "rb") if path.is_dir() else None
-    with inside or text.opened(path, _folder_in(path) + name) as stream:
+    with inside or text.opened(path, f"{_folder_in(path)}{name}") as stream:
         content = stream.read(MOST + 1)
     if len(content) > MOST:
         raise RecordingError(f"{path}, {name}: is larger than {MOST >> 20} MB: it is damaged")

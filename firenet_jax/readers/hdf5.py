@@ -35,6 +35,8 @@ from firenet_jax.readers import (
 )
 from firenet_jax.storage.files import check_readable
 
+Read = Callable[[slice], Events | Rows]
+
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 COLUMNS = {"event_cnn_minimal": ("ts", "xs", "ys", "ps"), "DSEC": ("t", "x", "y", "p")}
 MVSEC = "davis/left"
@@ -101,7 +103,7 @@ def _layout(path: Path, file: Any) -> str:
     )
 
 
-def _reader(path: Path, file: Any, layout: str) -> tuple[Callable[[slice], Events], int]:
+def _reader(path: Path, file: Any, layout: str) -> tuple[Read, int]:
     """(rows -> Events, number of rows)"""
     if layout in ("MVSEC", "v2e"):
         events = file[f"{MVSEC}/events" if layout == "MVSEC" else "events"]
@@ -111,12 +113,13 @@ def _reader(path: Path, file: Any, layout: str) -> tuple[Callable[[slice], Event
                 f"{path}: {events.name.strip('/')} has the shape {events.shape}, expected (N, 4)"
             )
 
-        def read(rows: slice) -> Events | Rows:
-            order = "xytp" if layout == "MVSEC" else "txyp"
+        order = "xytp" if layout == "MVSEC" else "txyp"
+
+        def read_table(rows: slice) -> Events | Rows:
             columns = dict(zip(order, events[rows].T, strict=True))
             return to_events(path, rows.start, *(columns[name] for name in "txyp"))
 
-        return read, len(events)
+        return read_table, len(events)
     if layout == "Metavision":
         events = file[METAVISION]
         _check_stored(path, events)
@@ -126,11 +129,11 @@ def _reader(path: Path, file: Any, layout: str) -> tuple[Callable[[slice], Event
                 "with fields x, y, p and t"
             )
 
-        def read(rows: slice) -> Events | Rows:
+        def read_fields(rows: slice) -> Events | Rows:
             part = events[rows]
             return to_events(path, rows.start, *(part[name] for name in "txyp"))
 
-        return read, len(events)
+        return read_fields, len(events)
 
     columns = [file["events"][name] for name in COLUMNS[layout]]
     for column in columns:
@@ -140,7 +143,7 @@ def _reader(path: Path, file: Any, layout: str) -> tuple[Callable[[slice], Event
         raise RecordingError(f"{path}: its columns differ in length: {found}")
     start = int(np.ravel(file["t_offset"])[0]) if "t_offset" in file and layout == "DSEC" else 0
 
-    def read(rows: slice) -> Events:
+    def read(rows: slice) -> Events | Rows:
         t, x, y, p = (column[rows] for column in columns)
         if start and t.dtype.kind in "iu":
             t = t.astype(np.int64) + start
@@ -160,7 +163,7 @@ def _check_stored(path: Path, data: Any):
             extra("hdf5plugin", path)
 
 
-def _events(path: Path, layout: str) -> Iterator[Events]:
+def _events(path: Path, layout: str) -> Iterator[Events | Rows]:
     with opened(path) as file:
         yield from in_chunks(*_reader(path, file, layout))
 

@@ -51,7 +51,8 @@ def matches(path: Path) -> bool:
 
 def read(path: Path, columns: str | None = None) -> Source:
     """columns: the order of those of an (N, 4) array, such as "x,y,p,t"."""
-    if path.is_file():
+    layout = _layout(path)
+    if layout is None:
         order = "txyp" if columns is None else "".join(_order(path, columns))
         count = len(_of_one_file(path, order)[0])
         return Source(
@@ -61,7 +62,6 @@ def read(path: Path, columns: str | None = None) -> Source:
         )
     if columns is not None:
         raise RecordingError(f"{path}: has its columns in files of their own: they have no order")
-    layout = _layout(path)
     t, _, _ = _columns(path, layout)
     frames = _frames(path, layout)
     size = _size(path)
@@ -126,11 +126,12 @@ def _of_one_file(path: Path, order: str) -> list[np.ndarray]:
 
 
 def _named(path: Path, arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
-    found = [next((arrays[n] for n in names if n in arrays), None) for names in text.NAMES.values()]
-    if any(column is None for column in found):
+    named = [[arrays[n] for n in names if n in arrays] for names in text.NAMES.values()]
+    if not all(named):
         raise RecordingError(
             f"{path}: holds {', '.join(map(repr, arrays)) or 'nothing'}, expected t, x, y and p"
         )
+    found = [columns[0] for columns in named]
     if len({column.shape for column in found}) != 1 or found[0].ndim != 1:
         shapes = ", ".join(str(column.shape) for column in found)
         raise RecordingError(f"{path}: columns of one length are expected, not {shapes}")
@@ -144,10 +145,10 @@ def _rows(path: Path, columns: list[np.ndarray]) -> Iterator[Events | Rows]:
     yield from in_chunks(read, len(columns[0]))
 
 
-def _events(path: Path, layout: str) -> Iterator[Events]:
+def _events(path: Path, layout: str) -> Iterator[Events | Rows]:
     t, xy, p = _columns(path, layout)
 
-    def read(rows: slice) -> Events:
+    def read(rows: slice) -> Events | Rows:
         return to_events(path, rows.start, t[rows], xy[rows, 0], xy[rows, 1], p[rows])
 
     yield from in_chunks(read, len(t))

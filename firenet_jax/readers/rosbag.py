@@ -23,12 +23,12 @@ from contextlib import contextmanager
 from itertools import chain
 from os.path import commonprefix
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from firenet_jax.errors import RecordingError, logger
-from firenet_jax.events import Events, Frames, Triggers
+from firenet_jax.events import Events, Frames, Rows, Triggers
 from firenet_jax.readers import (
     Source,
     all_triggers,
@@ -48,7 +48,7 @@ PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray
 IMAGE = "sensor_msgs/msg/Image"
 WORDS = 1 << 18  # words of 16 bits decoded at once: messages are tiny
 TORN = {".bag": torn_bag.Torn, ".mcap": torn_mcap.Torn}
-ORDERS = {"<": "little", ">": "big"}
+ORDERS: dict[str, Literal["little", "big"]] = {"<": "little", ">": "big"}
 CHANNELS = {"mono8": 1, "8UC1": 1, "mono16": 1, "16UC1": 1, "rgb8": 3, "bgr8": 3}
 
 
@@ -65,8 +65,9 @@ def read(path: Path) -> Source:
         topic = _only(path, [t for t, kind in topics.items() if kind in ARRAYS + PACKETS], topics)
         first = next((raw for _, raw in _raw(bag, topic)), None)
         size = None if first is None else _size(_Message(first, ros2))
-        packets = first is not None and topics[topic] in PACKETS
-        grey = packets and _packet(_Message(first, ros2)).encoding == "evt3"  # Prophesee's
+        grey = False
+        if first is not None and topics[topic] in PACKETS:
+            grey = _packet(_Message(first, ros2)).encoding == "evt3"  # Prophesee's
         images = [t for t, kind in topics.items() if kind == IMAGE]
         # Of several cameras' images, those of the same name: /dvs/events, /dvs/image_raw.
         image_topic = max(images, key=lambda name: len(commonprefix([name, topic])), default=None)
@@ -153,7 +154,7 @@ def _in_a_line(text: str) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
-def _raw(bag, topic: str, start: int | None = None) -> Iterator[tuple[int, bytes]]:
+def _raw(bag: Any, topic: str, start: int | None = None) -> Iterator[tuple[int, bytes]]:
     """(time of recording, bytes) of every message of a topic"""
     connections = [entry for entry in bag.connections if entry.topic == topic]
     for _, time, raw in bag.messages(connections, start):
@@ -204,7 +205,7 @@ def _size(message: _Message) -> tuple[int, int]:
     return message.number(4), message.number(4)
 
 
-def _events(path: Path, topic: str, arrays: bool) -> Iterator[Events]:
+def _events(path: Path, topic: str, arrays: bool) -> Iterator[Events | Rows]:
     row, ros2 = 0, not _is_ros1(path)
     with reading(path, Exception), _bag(path) as bag:
         messages = (_Message(raw, ros2) for _, raw in _raw(bag, topic))
@@ -393,7 +394,7 @@ def _frames(path: Path, bag, topic: str | None) -> Frames | None:
 
 
 def _encoding(message: _Message) -> str:
-    message.number(4), message.number(4)  # height, width
+    _height, _width = message.number(4), message.number(4)
     return message.text()
 
 

@@ -14,6 +14,7 @@ refuses is read again in Python, to name the line.
 """
 
 import gzip
+import math
 import re
 import zipfile
 import zlib
@@ -21,7 +22,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -89,7 +90,7 @@ def read(path: Path, member: str | None = None, columns: str | None = None) -> S
 
 
 @contextmanager
-def opened(path: Path, member: str | None = None) -> Iterator[BinaryIO]:
+def opened(path: Path, member: str | None = None) -> Iterator[Any]:
     """A file, or a file in a zip -> stream of its bytes; damage raises RecordingError."""
     with reading(path, *BROKEN), ExitStack() as stack:
         if member is not None:
@@ -131,8 +132,8 @@ def _sniff(path: Path, member: str | None, columns: str | None = None) -> Layout
         lines.pop()  # cut off
     size, names, unit, skip = None, ("t", "x", "y", "p"), None, len(lines)
     told = columns is not None
-    if told:
-        names, unit = _names(columns.lower())
+    if columns is not None and (named := _names(columns.lower())):
+        names, unit = named
     for number, line in enumerate(map(str.strip, lines), 1):
         words = _words(line, "," if "," in line else " ")
         if match := re.fullmatch(r"%geometry:(\d+),(\d+)", line):
@@ -194,13 +195,13 @@ def _names(line: str) -> tuple[tuple[str, ...], float | None] | None:
     named = [known.get(name, f"_{i}") for i, (name, _, _) in enumerate(words)]
     told = {i: units.get(in_brackets) for i, (_, _, in_brackets) in enumerate(words)}
     if "t" not in named:  # then `t_us`; the finest, if there are several
+        finest = math.inf
         for i, (name, _, _) in enumerate(words):
             stem, _, unit = name.rpartition("_")
-            if known.get(stem) == "t" and unit in units:
-                told[i] = units[unit]
-                if "t" not in named or told[i] < told[named.index("t")]:
-                    named = [f"_{k}" if key == "t" else key for k, key in enumerate(named)]
-                    named[i] = "t"
+            if known.get(stem) == "t" and unit in units and units[unit] < finest:
+                told[i] = finest = units[unit]
+                named = [f"_{k}" if key == "t" else key for k, key in enumerate(named)]
+                named[i] = "t"
     if any(named.count(key) != 1 for key in NAMES):
         return None
     return tuple(named), told[named.index("t")]
@@ -246,7 +247,7 @@ def _words(line: str, separator: str) -> list[str]:
     return [word.strip() for word in line.split(",")] if separator == "," else line.split()
 
 
-def _pieces(stream: BinaryIO, size: int) -> Iterator[bytes]:
+def _pieces(stream: Any, size: int) -> Iterator[bytes]:
     """So many bytes at a time; what comes before damage comes before its error."""
     error, found = None, b"."
     while found:
@@ -301,7 +302,7 @@ def _events(path: Path, member: str | None, layout: Layout) -> Iterator[Events |
         except pa.ArrowInvalid:
             yield _sorted_out(path, number, block, layout, place)
             continue
-        yield to_events(path, 0, *_columns(table, layout), place)
+        yield to_events(path, 0, *_columns(table, layout), place=place)
 
 
 def _columns(table: pa.Table, layout: Layout) -> list[np.ndarray]:
@@ -366,7 +367,7 @@ def _sorted_out(
     for column in map(np.asarray, columns):  # rows that are none are zero
         everything.append(np.zeros(len(bad), column.dtype))
         everything[-1][~bad] = column
-    rest = to_events(path, 0, *everything, place)
+    rest = to_events(path, 0, *everything, place=place)
     if isinstance(rest, Events):
         return Rows(rest, bad, RecordingError(said))
     earlier = np.argmax(rest.bad) < np.argmax(bad)

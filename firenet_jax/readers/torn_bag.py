@@ -87,9 +87,9 @@ class Torn:
 
 
 def _bytes(file: BinaryIO, size: bytes) -> bytes:
-    size = struct.unpack("<I", size)[0]
-    data = file.read(size) if size <= LARGEST else b""
-    if len(data) != size:
+    count = struct.unpack("<I", size)[0]
+    data = file.read(count) if count <= LARGEST else b""
+    if len(data) != count:
         raise EOFError("ends within a record")
     return data
 

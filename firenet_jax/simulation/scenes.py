@@ -313,10 +313,11 @@ def _blurred(image: jax.Array, sigma: jax.Array) -> jax.Array:
     for axis in (0, 1):
         padded = jnp.pad(image, [(BLUR * (a == axis),) * 2 for a in (0, 1)], mode="reflect")
         size = image.shape[axis]
-        image = sum(
+        shifted = (
             weights[k] * jax.lax.slice_in_dim(padded, k, k + size, axis=axis)
             for k in range(2 * BLUR + 1)
         )
+        image = sum(shifted, jnp.zeros_like(image))
     return image
 
 
@@ -564,7 +565,8 @@ def flow(
     # each use, in a way that is ten times slower on a CPU.
     def distances(to_plane, x, y):
         def one(inputs):
-            return _inside(*inputs[:2], *_project(inputs[2], x, y))
+            outline, radii, matrix = inputs
+            return _inside(outline, radii, *_project(matrix, x, y))
 
         return jax.lax.map(one, (scene.outlines, scene.radius, to_plane[1:]))
 
@@ -614,8 +616,8 @@ def rendering_times(
     at = done[np.searchsorted(grid, bounds)]
     counts = np.maximum(np.ceil(np.diff(at)), 1).astype(int)
     steps = [
-        np.linspace(*ends, count, endpoint=False)
-        for ends, count in zip(np.stack([at[:-1], at[1:]], -1), counts, strict=True)
+        np.linspace(begin, end, count, endpoint=False)
+        for begin, end, count in zip(at[:-1], at[1:], counts, strict=True)
     ]
     times = np.round(np.interp(np.concatenate([*steps, at[-1:]]), done, grid)).astype(np.int64)
     return np.union1d(times, bounds)

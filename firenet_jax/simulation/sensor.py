@@ -23,11 +23,12 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from firenet_jax.errors import SettingsError
 from firenet_jax.events import BINS, Events, concatenate
@@ -49,11 +50,14 @@ NEARLY_NOISELESS = 2 / 3
 AT_REST = (0.01, 0.7)
 
 
+Fault = TypeVar("Fault", float, tuple[float, float])
+
+
 def _or(said: float | None, default: float) -> float:
     return default if said is None else said
 
 
-def _on(fault: float | tuple[float, float] | None) -> bool:
+def _on(fault: Fault | None) -> TypeGuard[Fault]:
     return fault is not None and fault not in (0, (0, 0), [0, 0])
 
 
@@ -257,14 +261,16 @@ def first_state(sensor: Sensor, image: jax.Array) -> SensorState:
     """The first rendering (H, W) sets every pixel's reference."""
     log = log_intensity(image)
     above = jnp.zeros_like(log)
-    if sensor.drift is not None:
+    if sensor.drift is not None and sensor.phase is not None:
         drifted = jnp.where(sensor.drift > 0, sensor.on, -sensor.off) * sensor.phase
         above = jnp.where(sensor.drift != 0, drifted, above)
     if sensor.start is not None:
         above = sensor.start
     silent = None if sensor.refractory is None else jnp.zeros(image.shape, jnp.int32)
     # A later bit of the phase than those that say when a pixel leaks.
-    noise_on = None if sensor.noise is None else sensor.phase * 1024 % 2 < 1
+    noise_on = None
+    if sensor.noise is not None and sensor.phase is not None:
+        noise_on = sensor.phase * 1024 % 2 < 1
     return SensorState(log, above, silent, noise_on, jnp.int32(0))
 
 
@@ -304,11 +310,11 @@ def step(
     above = above - polarity * threshold * crossings
     run = Run(first, spacing, count, polarity)
     silent = None
-    if sensor.refractory is not None:
+    if sensor.refractory is not None and state.silent is not None:
         run, silent = _refractory(run, state.silent, sensor.refractory, ticks)
 
     runs, noise_on = (run,), state.noise_on
-    if sensor.noise is not None:
+    if sensor.noise is not None and noise_on is not None:
         key = jax.random.fold_in(sensor.key, state.renderings)
         rate, light = sensor.noise
         expected = seconds * rate * (1 - (1 - light) * image)
@@ -370,14 +376,14 @@ def _listed(sensor, state, image, duration):
     return state, runs, sum(run.count.sum() for run in runs)
 
 
-def event_list(sensor: Sensor, renderings: Iterable[tuple[int, np.ndarray]]) -> Iterator[Events]:
+def event_list(sensor: Sensor, renderings: Iterable[tuple[int, ArrayLike]]) -> Iterator[Events]:
     """(microseconds, image (H, W)) in time order -> chunks of time-sorted events, one per interval.
 
     The first rendering gives no events. How dense renderings must be is said by
     `scenes.rendering_times`. Raises SettingsError where time does not advance, or by more than two
     seconds.
     """
-    state = previous = None
+    state, previous = None, 0
     for time, image in renderings:
         time, image = int(time), jnp.asarray(image, jnp.float32)
         if state is None:
@@ -507,19 +513,20 @@ def _votes(planes: jax.Array, low, runs, passed: jax.Array, total: jax.Array) ->
             for n, plane in enumerate(planes)
         ]
 
-    planes, run = list(planes), runs[0]
-    most = run.count.max()
+    first = runs[0]
+    most = first.count.max()
 
     def several(carry):
         number, planes = carry
         for n in range(AT_ONCE):
-            planes = vote(planes, run, number + n)
+            planes = vote(planes, first, number + n)
         return number + AT_ONCE, planes
 
-    _, planes = jax.lax.while_loop(lambda carry: carry[0] < most, several, (jnp.int32(0), planes))
+    start = jnp.int32(0), list(planes)
+    _, voted = jax.lax.while_loop(lambda carry: carry[0] < most, several, start)
     for run in runs[1:]:  # noise: one event at most
-        planes = vote(planes, run, 0)
-    return jnp.stack(planes)
+        voted = vote(voted, run, 0)
+    return jnp.stack(voted)
 
 
 def check_rare(slow: float, swift: float) -> None:
@@ -603,9 +610,9 @@ def random_setups(
         ground = jnp.where(is_swift[:, None, None], grey, scenes.textures[0])
         scenes = scenes._replace(textures=(ground, *scenes.textures[1:]))
     if scene.halt and sensors.noise is not None:
-        sensors = _noisy_at_rest(
-            jax.random.fold_in(number_key, 2), sensors, scenes, windows, duration
-        )
+        rest_key = jax.random.fold_in(number_key, 2)
+        noise = _noisy_at_rest(rest_key, sensors.noise, scenes, windows, duration)
+        sensors = sensors._replace(noise=noise)
     return sensors, scenes, duration
 
 
@@ -654,9 +661,9 @@ def _uneven(sensors: Sensor, kind: jax.Array, is_slow: jax.Array, slow: float) -
 
 
 def _noisy_at_rest(
-    key: jax.Array, sensors: Sensor, scenes: Scene, windows: int | jax.Array, duration: jax.Array
-) -> Sensor:
-    """Noise (see `AT_REST`) for half of the sequences that stop for good."""
+    key: jax.Array, noise: jax.Array, scenes: Scene, windows: int | jax.Array, duration: jax.Array
+) -> jax.Array:
+    """The sensors' noise, but that of `AT_REST` for half of the sequences that stop for good."""
     seconds = 1e-6 * duration
     stopped = scenes.pauses[:, 0, 1] - scenes.pauses[:, 0, 0] > windows * seconds
     low, high = (math.log(bound) for bound in AT_REST)
@@ -664,7 +671,7 @@ def _noisy_at_rest(
     rate = jnp.exp(low + (high - low) * share) / seconds
     chosen = (stopped & (noisy < 0.5))[:, None]
     uniform = jnp.stack([rate, jnp.ones_like(rate)], -1)
-    return sensors._replace(noise=jnp.where(chosen, uniform, sensors.noise))
+    return jnp.where(chosen, uniform, noise)
 
 
 def window_bounds(durations: jax.Array, windows: int, first: jax.Array | int = 0) -> jax.Array:

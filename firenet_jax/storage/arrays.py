@@ -9,6 +9,7 @@ It is written beside its final name and renamed when it is whole.
 
 import os
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -25,7 +26,7 @@ class ArraysWriter:
             self.held = self.partial.open("ab")
             lock_file(self.held, path)
             # HDF5 would take the same lock once more, and find it taken.
-            self.file = h5py.File(self.partial, "w", locking=False)
+            self.file: Any = h5py.File(self.partial, "w", locking=False)
 
     def _start(self, height: int, width: int) -> None:
         self.file.attrs["description"] = "images of events, by firenet_jax"

@@ -13,6 +13,7 @@ import os
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,13 +38,10 @@ class BagWriter:
     writes the bag, or a time is before 0, which ROS cannot say."""
 
     def __init__(self, path: Path, topic: str, frame_id: str):
-        self.path, self.partial, self.topic, self.frame_id = (
-            path,
-            partial_name(path),
-            topic,
-            frame_id,
-        )
-        self.ros2, self.count, self.bag = path.suffix == ".ros2", 0, None
+        self.path, self.partial = path, partial_name(path)
+        self.topic, self.frame_id = topic, frame_id
+        self.ros2, self.count = path.suffix == ".ros2", 0
+        self.bag: Any = None
         self.holding = contextlib.ExitStack()
         try:
             self.library = importlib.import_module(f"rosbags.rosbag{1 + self.ros2}")
@@ -55,7 +53,7 @@ class BagWriter:
         stores = types.Stores
         self.types = types.get_typestore(stores.ROS2_HUMBLE if self.ros2 else stores.ROS1_NOETIC)
 
-    def _start(self) -> None:
+    def _start(self) -> Any:
         """At the first picture: a database serves the thread that opened it and no other."""
         _remove(self.partial, self.path)  # of a run that was killed
         choice = {"version": 9} if self.ros2 else {}
@@ -67,6 +65,7 @@ class BagWriter:
             self.holding.callback(os.close, handle)
             lock(handle, self.path)
         self.connection = bag.add_connection(self.topic, IMAGE, typestore=self.types)
+        return bag
 
     def write(self, picture: np.ndarray, time: int, events: int = 0) -> None:
         """picture: (H, W) or (H, W, 3) uint8; time: microseconds."""
@@ -93,9 +92,8 @@ class BagWriter:
         )
         serialise = self.types.serialize_cdr if self.ros2 else self.types.serialize_ros1
         with writing(self.path):
-            if self.bag is None:
-                self._start()
-            self.bag.write(self.connection, 1000 * time, serialise(message, IMAGE))
+            bag = self.bag or self._start()
+            bag.write(self.connection, 1000 * time, serialise(message, IMAGE))
         self.count += 1
 
     def finish(self) -> None:

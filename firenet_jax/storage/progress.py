@@ -33,7 +33,7 @@ class _Lines(tqdm):
         """Without a last line: what there is to say is said by others."""
         if not self.disable:
             self.disable = True
-            self._decr_instances(self)
+            self._decr_instances(self)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def bar(total: float | None, unit: str, quiet: bool = False, **choices) -> tqdm:

@@ -25,6 +25,7 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -146,7 +147,7 @@ def _read_old(content: bytes) -> dict[str, np.ndarray]:
     tensors = _state_dict(_unpickle(stream, storages))
 
     elements = {}
-    keys = _unpickle(stream, {})
+    keys: Any = _unpickle(stream, {})
     listed = isinstance(keys, list) and all(isinstance(key, str) for key in keys)
     if not listed or sorted(keys) != sorted(storages):
         raise CheckpointError(f"is damaged (it does not list the storages it needs); {AGAIN}")
@@ -479,6 +480,7 @@ def _unpickle(stream: io.BytesIO, storages: dict[str, _Storage]):
         del stack[len(stack) - n :]
         return items
 
+    arg: Any
     for opcode, arg, _position in pickletools.genops(stream):
         match opcode.name:
             case "BINUNICODE" | "SHORT_BINUNICODE" | "BINUNICODE8" | "UNICODE":

@@ -13,9 +13,11 @@ import tempfile
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
+from typing import Any, TextIO
 
 import av
 import numpy as np
+from av.filter import Graph
 from PIL import Image
 
 from firenet_jax.errors import OutputError
@@ -143,29 +145,30 @@ class FolderWriter:
     def __init__(self, path: Path, at_times: bool = False, in_nanoseconds: bool = False):
         self.path, self.partial = path, partial_name(path)
         self.at_times, self.in_nanoseconds = at_times, in_nanoseconds
-        self.count, self.stamps = 0, None
+        self.count = 0
+        self.stamps: TextIO | None = None
         self.holding = contextlib.ExitStack()
         with writing(path):
             self.partial.mkdir(exist_ok=True)
             self.holding.enter_context(locked(self.partial, path))
 
-    def keep(self, done: int) -> None:
+    def keep(self, done: int) -> TextIO:
         """Goes on after so many pictures of an earlier run; what lies beyond is written again."""
         self.count = done
         with writing(self.path):
-            self.stamps = (self.partial / "timestamps.txt").open("a+", newline="")
-            self.stamps.seek(0)
-            kept = list(itertools.islice(self.stamps, done + self.at_times if done else 0))
-            self.stamps.truncate(sum(map(len, kept)))
+            stamps = self.stamps = (self.partial / "timestamps.txt").open("a+", newline="")
+            stamps.seek(0)
+            kept = list(itertools.islice(stamps, done + self.at_times if done else 0))
+            stamps.truncate(sum(map(len, kept)))
             if self.at_times and not kept:
-                self.stamps.write(HEADER)
+                stamps.write(HEADER)
+        return stamps
 
     def _name(self, time: int) -> str:
         return f"{1000 * time:019d}" if self.in_nanoseconds else f"frame_{self.count:010d}"
 
     def write(self, picture: np.ndarray, time: int, events: int = 0) -> None:
-        if self.stamps is None:
-            self.keep(0)
+        stamps = self.stamps or self.keep(0)
         name = self._name(time)
         if self.in_nanoseconds and time < 0:
             raise OutputError(
@@ -176,14 +179,15 @@ class FolderWriter:
             Image.fromarray(picture).save(self.partial / f"{name}.png", compress_level=PNG_LEVEL)
             seconds, rest = divmod(abs(time), 1_000_000)
             if self.at_times:
-                self.stamps.write(f"{self.count} {time} {events}\n")
+                stamps.write(f"{self.count} {time} {events}\n")
             else:
-                self.stamps.write(f"{'-' * (time < 0)}{seconds}.{rest:06d}\n")
+                stamps.write(f"{'-' * (time < 0)}{seconds}.{rest:06d}\n")
         self.count += 1
 
     def flush(self) -> None:
         with writing(self.path):
-            self.stamps.flush()
+            if self.stamps is not None:
+                self.stamps.flush()
 
     def _names(self) -> set[str]:
         if not self.in_nanoseconds:
@@ -193,7 +197,8 @@ class FolderWriter:
 
     def finish(self) -> None:
         with writing(self.path):
-            self.stamps.close()
+            if self.stamps is not None:
+                self.stamps.close()
             mine = self._names()
             for extra in self.partial.glob("*.png"):  # of a longer run before this one
                 if extra.stem not in mine:
@@ -246,9 +251,10 @@ class VideoWriter:
             self.held = self.partial.open("ab")
             lock_file(self.held, path)
             self.container = av.open(str(self.partial), "w")
-        self.stream = self.filter = None
+        self.stream: Any = None
+        self.filter: Graph | None = None
 
-    def _start(self, height: int, width: int) -> None:
+    def _start(self, height: int, width: int) -> Any:
         if self.path.suffix == ".gif":
             self.stream = self.container.add_stream("gif", rate=self.rate)
             self.stream.pix_fmt = "pal8"
@@ -259,6 +265,7 @@ class VideoWriter:
             self.stream.options = {"crf": "18", "preset": "veryfast"}
         self.stream.height, self.stream.width = height, width
         self.stream.codec_context.time_base = self.tick
+        return self.stream
 
     @property
     def slower(self) -> float | None:
@@ -270,8 +277,7 @@ class VideoWriter:
         if self.path.suffix == ".mp4":  # chroma at half the size wants even sides
             odd = [(0, side % 2) for side in picture.shape[:2]]
             picture = np.pad(picture, odd + [(0, 0)] * (picture.ndim - 2), mode="edge")
-        if self.stream is None:
-            self._start(*picture.shape[:2])
+        stream = self.stream or self._start(*picture.shape[:2])
         layout = "gray" if picture.ndim == 2 else "rgb24"
         if self.filter:  # the filter graph was made for colours
             picture = np.stack([picture] * 3, -1) if picture.ndim == 2 else picture
@@ -287,7 +293,7 @@ class VideoWriter:
             self.filter.vpush(frame)
             frame = self.filter.vpull()
         with writing(self.path):
-            self.container.mux(self.stream.encode(frame))
+            self.container.mux(stream.encode(frame))
 
     def finish(self) -> None:
         with writing(self.path):
@@ -309,9 +315,9 @@ class VideoWriter:
         self.held.close()
 
 
-def _palette_filter(height: int, width: int, tick: Fraction) -> av.filter.Graph:
+def _palette_filter(height: int, width: int, tick: Fraction) -> Graph:
     """A filter graph that gives every gif picture the 256 colours that suit it best."""
-    graph = av.filter.Graph()
+    graph: Any = Graph()  # its types do not know formats by name
     source = graph.add_buffer(width=width, height=height, format="rgb24", time_base=tick)
     split = graph.add("split")
     palette = graph.add("palettegen", "stats_mode=single")

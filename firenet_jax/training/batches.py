@@ -20,13 +20,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import grain
-import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.errors import RecordingError, SettingsError, logger
-from firenet_jax.events import BINS, Events, checked, event_number
+from firenet_jax.events import BINS, Events, Rows, checked, event_number
 from firenet_jax.readers import CHUNK, frame_times, to_events, to_frame
 from firenet_jax.readers.hdf5 import opened
 from firenet_jax.simulation.sensor import Simulation
@@ -169,7 +168,7 @@ def _index(path: Path) -> Index:
     return Index(names, times, rows)
 
 
-def _stamps(path: Path, column: Any) -> Iterator[Events]:
+def _stamps(path: Path, column: Any) -> Iterator[Events | Rows]:
     """Events of which only the time is known."""
     for start in range(0, len(column), CHUNK):
         t = column[start : start + CHUNK]
@@ -254,14 +253,13 @@ def _pauses(numbers: np.ndarray, augment: Augment) -> np.ndarray:
     return paused
 
 
-def _read_events(file: h5py.File, facts: Facts, rows: slice) -> Events:
+def _read_events(file: Any, facts: Facts, rows: slice) -> Events:
     columns = (file["events"][name][rows] for name in ("ts", "xs", "ys", "ps"))
     events = to_events(facts.path, rows.start, *columns)
-    for _ in checked(
+    right = checked(
         [events], facts.path, facts.height, facts.width, lambda row: event_number(rows.start + row)
-    ):
-        pass
-    return events
+    )
+    return next(right, Events.empty())
 
 
 def _cropped(events: Events, top, left, crop: int, down, across) -> Events:
@@ -324,7 +322,7 @@ def batches(
     """
     examples = _long_enough(files, crop, chain * windows)
     index = cache(_index)  # of all files: 2 kB each
-    order = grain.MapDataset.range(len(examples)).shuffle(seed=seed).repeat()
+    order: Any = grain.MapDataset.range(len(examples)).shuffle(seed=seed).repeat()
 
     def load(n: int) -> Batch:
         numbers = n // chain * batch + np.arange(batch)
@@ -346,7 +344,7 @@ def batches(
             np.stack([example.images for example in loaded], 1),
             np.stack([example.displacement for example in loaded], 1),
             numbers.astype(np.uint32),
-            np.int32(n % chain),
+            np.array(n % chain, np.int32),
         )
 
     return iter(
@@ -386,7 +384,7 @@ def _long_enough(files: Sequence[Path], crop: int, total: int) -> list[Facts]:
 @partial(jax.jit, static_argnames="augment")
 def _simulation(key: jax.Array, batch: Batch, augment: Augment) -> Simulation:
     """Adds hot pixels and noise to the tensors; finds where the displacement can be used."""
-    images = batch.images.astype(jnp.float32) / 255
+    images = jnp.asarray(batch.images, jnp.float32) / 255
     steps, _, height, width = images.shape
     tensors = voxelise(batch.packed, height=height, width=width)
 

@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -59,11 +59,11 @@ class State(NamedTuple):
 def initial_state(batch: int, height: int, width: int, settings: Settings = Settings()) -> State:
     """The state before the first window of event tensors (batch, height, width, 5): zeros."""
     height, width = _padded(height, width)
-    zeros = tuple(
+    a, b, c = (
         jnp.zeros((batch, height // n, width // n, settings.channels * n), jnp.float32)
         for n in (2, 4, 8)
     )
-    return State(zeros, zeros)
+    return State((a, b, c), (a, b, c))
 
 
 def _padded(height: int, width: int) -> tuple[int, int]:
@@ -156,7 +156,8 @@ def step(
     height, width = event_tensor.shape[1:3]
     (top, _), (left, _) = sides = padding(height, width, STRIDE)
     tensor = jnp.pad(event_tensor, ((0, 0), *sides, (0, 0)), mode="reflect")
-    state, image = E2VID(settings).apply({"params": params}, state, tensor)
+    network: Any = E2VID(settings)  # flax does not say what `apply` returns
+    state, image = network.apply({"params": params}, state, tensor)
     return state, image[:, top : top + height, left : left + width]
 
 

@@ -125,7 +125,7 @@ def advance(
     if settings.bilateral:
         image = bilateral(image, settings.bilateral)
     low, high = jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32)
-    return HighPassState(log_intensity, low, high, sums.time), image
+    return HighPassState(log_intensity, low, high, jnp.asarray(sums.time)), image
 
 
 def _intensity(log_intensity: jax.Array) -> jax.Array:

@@ -104,7 +104,8 @@ def step(
 
     Compiles once for each of a few sizes of windows (`tensors.CAPACITIES`) and each settings.
     """
-    return advance(state, pack(window, *state.image.shape, settings.packet), settings)
+    height, width = state.image.shape
+    return advance(state, pack(window, height, width, settings.packet), settings)
 
 
 def pack(window: Window, height: int, width: int, packet: int = 1000) -> Packets:
@@ -113,9 +114,9 @@ def pack(window: Window, height: int, width: int, packet: int = 1000) -> Packets
     unused = -len(pixel) % packet
     pixel = np.pad(pixel, (0, unused), constant_values=height * width)
     age, p = np.pad(age, (0, unused)), np.pad(p, (0, unused))
-    count = np.int32(-(-len(window.events) // packet))
-    rows = (column.reshape(-1, packet) for column in (pixel, age, p))
-    return Packets(*rows, count, clock(window.time))
+    count = np.array(-(-len(window.events) // packet), np.int32)
+    pixel, age, p = (column.reshape(-1, packet) for column in (pixel, age, p))
+    return Packets(pixel, age, p, count, clock(window.time))
 
 
 @partial(jax.jit, static_argnames="settings")
@@ -143,9 +144,10 @@ def advance(
 
     # A loop with as many turns as there are packets with events: unused ones cost no time.
     carry = state.image, state.dual, surface, state.surface_dual
-    carry = jax.lax.fori_loop(0, packets.count, denoise_packet, carry)
-    shown = (carry[0] - settings.darkest) / (settings.brightest - settings.darkest)
-    return ManifoldState(*carry, packets.time), shown
+    image, dual, surface, surface_dual = jax.lax.fori_loop(0, packets.count, denoise_packet, carry)
+    shown = (image - settings.darkest) / (settings.brightest - settings.darkest)
+    time = jnp.asarray(packets.time)
+    return ManifoldState(image, dual, surface, surface_dual, time), shown
 
 
 def _contrasts(pixel, p, shape, settings: Manifold) -> jax.Array:

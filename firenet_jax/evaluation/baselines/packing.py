@@ -8,6 +8,7 @@ whole seconds and microseconds, since jax has no int64.
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from firenet_jax.tensors import capacity
 from firenet_jax.windows import Window
@@ -37,7 +38,7 @@ def clock(time: int) -> np.ndarray:
     return np.array(divmod(time, 10**6), np.int64).astype(np.int32)
 
 
-def seconds_between(earlier: jax.Array, later: jax.Array) -> jax.Array:
+def seconds_between(earlier: jax.Array, later: ArrayLike) -> jax.Array:
     """Two times of `clock` -> float32 s."""
-    seconds, microseconds = (later - earlier).astype(jnp.float32)
+    seconds, microseconds = (jnp.asarray(later) - earlier).astype(jnp.float32)
     return seconds + 1e-6 * microseconds
