@@ -21,12 +21,14 @@ def output(tmp_path):
 
 
 def test_a_position_is_there_once_it_is_published(output):
-    assert resume.is_kept(output, 8) and not resume.is_kept(output, 4)
     found = resume.read_position(output, RECORD, overwrite=False)
     assert (int(found["steps"]), int(found["pictures"]), len(found["state0"])) == (4, 3, 4)
+    resume.publish_position(output, 8)
+    assert int(resume.read_position(output, RECORD, overwrite=False)["steps"]) == 8
+    resume.keep_position(output, RECORD, 12, 11)
     resume.remove_unpublished(output)
-    assert not resume.is_kept(output, 8)
-    assert int(resume.read_position(output, RECORD, overwrite=False)["steps"]) == 4
+    resume.publish_position(output, 12)  # nothing was kept
+    assert int(resume.read_position(output, RECORD, overwrite=False)["steps"]) == 8
     assert resume.read_position(output.with_name("b"), RECORD, overwrite=False) is None
 
 

@@ -154,10 +154,6 @@ class Part(NamedTuple):
     pictures: int  # of these
     ends: bool  # no steps follow
 
-    @property
-    def can_be_resumed(self) -> bool:
-        return not self.ends and isinstance(self.running.writer, FolderWriter)
-
 
 class Chunk(NamedTuple):
     """T x B steps on their way to the device, and whose they are."""
@@ -354,8 +350,11 @@ def computed(
         )  # fmt: skip
         states = {}
         if time.monotonic() - kept > RESUME_EVERY:
-            goes_on = [slot for slot, part in chunk.parts.items() if part.can_be_resumed]
-            states = {slot: _get_slot(session, slot) for slot in goes_on}
+            states = {
+                slot: _get_slot(session, slot)
+                for slot, part in chunk.parts.items()
+                if isinstance(part.running.writer, FolderWriter) and not part.ends
+            }
             kept = time.monotonic()
         sent.append((chunk, shown, states))
         if len(sent) == in_flight:
@@ -396,10 +395,9 @@ def write(part: Part, shown: np.ndarray, screen: Screen | None) -> int:
             if screen:
                 screen.show(image, str(running.job.output))
     running.written += count
-    output = running.job.output
-    if isinstance(running.writer, FolderWriter) and resume.is_kept(output, part.reached):
+    if isinstance(running.writer, FolderWriter) and not part.ends:
         running.writer.flush()
-        resume.publish_position(output, part.reached)
+        resume.publish_position(running.job.output, part.reached)
     return count
 
 

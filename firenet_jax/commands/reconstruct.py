@@ -197,16 +197,10 @@ def run(settings: Reconstruct) -> list[Path]:
 def do_all(jobs: list[Job], settings: Reconstruct, weights: Weights, outcome: Outcome) -> None:
     """Jobs of any sensor sizes, under one bar."""
     way = Way(
-        network=settings.network,
-        display=settings.display,
-        preview=settings.preview,
-        raw=settings.output.suffix == ".h5",
-        at_times=settings.times.wanted,
-        chunk=settings.chunk,
-        batch=settings.batch,
-        several=len(settings.recordings) > 1,
-        overwrite=settings.overwrite,
-    )
+        settings.network, settings.display, settings.preview, settings.output.suffix == ".h5",
+        settings.times.wanted, settings.chunk, settings.batch, len(settings.recordings) > 1,
+        settings.overwrite,
+    )  # fmt: skip
     counts = [job.recording.count for job in jobs if job.recording.count is not None]
     partly = settings.start or settings.stop or settings.windows.step
     known = None if len(counts) < len(jobs) or partly else sum(counts)

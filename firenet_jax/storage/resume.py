@@ -60,13 +60,10 @@ def keep_position(output: Path, record: dict, steps: int, pictures: int, **array
         np.savez(path, record=json.dumps(record), steps=steps, pictures=pictures, **arrays)
 
 
-def is_kept(output: Path, steps: int) -> bool:
-    return _kept(output, steps).exists()
-
-
 def publish_position(output: Path, steps: int) -> None:
-    """What was kept after so many steps: their pictures are on disk."""
-    os.replace(_kept(output, steps), position_file(output))
+    """What was kept after so many steps, if anything was: their pictures are on disk."""
+    if _kept(output, steps).exists():
+        os.replace(_kept(output, steps), position_file(output))
 
 
 def read_position(output: Path, record: dict, overwrite: bool) -> dict[str, Any] | None:
