@@ -30,8 +30,8 @@ from PIL import Image
 from pytorch_firenet import FireNet, normalise, to_picture, voxelise_original
 
 from firenet_jax.checkpoint import load_weights
-from firenet_jax.commands import reconstruct as pipeline
-from firenet_jax.commands.reconstruct import Job, Reconstruct, in_chunks
+from firenet_jax.commands.jobs import Job, Outcome, Way, in_chunks
+from firenet_jax.commands.reconstruct import Reconstruct, run
 from firenet_jax.events import Events
 from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import events_to_pictures, initial_session
@@ -77,18 +77,18 @@ def by_pytorch(recording: Path, output: Path) -> None:
 
 
 def by_us(recording: Path, output: Path) -> None:
-    pipeline.run(Reconstruct((recording,), output, windows=WINDOWS))
+    run(Reconstruct((recording,), output, windows=WINDOWS))
 
 
 def stages(recording: Path, folder: Path) -> dict:
     """Functions that do one stage each, the others' work done before."""
-    settings = Reconstruct((recording,), folder / "none")
     weights = jax.device_put(load_weights())
 
     def reading() -> list:
-        job = Job(open_recording(recording), folder / "none", "", WINDOWS)
+        opened, output = open_recording(recording), folder / "none"
         writers = {}
-        chunks = list(in_chunks([job], settings, 1, 1, failed={}, writers=writers))
+        job = Job(opened, output, {}, WINDOWS, None, opened.events, lambda: FolderWriter(output))
+        chunks = list(in_chunks([job], Way(), 1, 1, Outcome(), writers))
         for writer in writers.values():  # which was opened and locked its folder
             writer.abandon()
         return chunks
@@ -96,7 +96,7 @@ def stages(recording: Path, folder: Path) -> dict:
     chunks = reading()
 
     def device() -> list:
-        session, pictures = initial_session(1, HEIGHT, WIDTH, settings.network), []
+        session, pictures = initial_session(1, HEIGHT, WIDTH, Way().network), []
         for chunk in chunks:
             session, shown = events_to_pictures(
                 weights, session, chunk.events, chunk.valid, height=HEIGHT, width=WIDTH

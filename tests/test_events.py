@@ -1,7 +1,10 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from firenet_jax.events import Events
+from firenet_jax.errors import RecordingError
+from firenet_jax.events import Events, checked
 
 
 @pytest.mark.parametrize("p", [[-1, 1], [0, 1], [False, True]])
@@ -16,3 +19,64 @@ def test_seconds_are_no_times():
     with pytest.raises(ValueError, match="whole microseconds: round 1e6 times seconds"):
         Events.of([0.25, 0.75], [0, 0], [0, 0], [0, 1])
     assert len(Events.of([], [], [], [])) == 0
+
+
+def passed(chunks, strict=True, width=24):
+    """Times and places that `checked` passes on, and what it says."""
+    said = []
+    found = checked(
+        chunks,
+        Path("a"),
+        18,
+        width,
+        strict=strict,
+        say=lambda sentence, rows: said.append(sentence),
+    )
+    return [list(zip(part.t.tolist(), part.x.tolist(), strict=True)) for part in found], said
+
+
+def row(t, x=1, y=2):
+    return Events.of([t], [x], [y], [1])
+
+
+def many(first, count=2000, then=()):
+    """Right events, one a microsecond, and then some at these times."""
+    t = [*range(first, first + count), *then]
+    return Events.of(t, np.ones(len(t)), np.ones(len(t)), np.ones(len(t)))
+
+
+def test_events_that_are_right_pass_as_they_are():
+    found, said = passed([row(5), Events.empty(), row(5, x=23), row(9, x=0)])
+    assert found == [[(5, 1)], [(5, 23)], [(9, 0)]] and not said
+
+
+@pytest.mark.parametrize(
+    "x, y, width, named",
+    [
+        (24, 2, 24, "x is 24, outside"), (-1, 2, 24, "x is -1, but"), (30, 40, 24, "x is 30, out"),
+        (5, 18, 24, "y is 18, outside"), (23, -2, 24, "y is -2, but"), (0, 18, None, "y is 18, ou"),
+        (-3, 1, None, "x is -3, but"),
+    ],
+)  # fmt: skip
+def test_the_first_coordinate_that_is_wrong_is_named(x, y, width, named):
+    with pytest.raises(RecordingError, match=f"a, event 2: {named}"):
+        passed([row(1), row(2, x, y)], width=width)
+
+
+def test_an_error_is_said_once_by_what_is_raised():
+    """Even where rows were left out before it."""
+    said = []
+    bad = many(5000, count=500, then=[1, 2, 3, 4])
+    found = checked([many(0, then=[10]), bad], Path("a"), 18, 24, strict=False,
+                    say=lambda *what: said.append(what))  # fmt: skip
+    with pytest.raises(RecordingError, match="event 2502: time runs backwards"):
+        list(found)
+    assert not said
+
+
+def test_time_goes_on_from_the_last_event_that_was_kept():
+    """After a chunk of which a row was left out, as after one that was right."""
+    found, said = passed([many(0, then=[10]), many(1998, count=9000)], strict=False)
+    times = [t for part in found for t, _ in part]
+    assert times == [*range(2000), *range(1999, 10998)]
+    assert len(said) == 1 and "left out: 2 of 11,001 events" in said[0]

@@ -15,7 +15,7 @@ from PIL import Image
 from processes import finish, start
 
 from firenet_jax.checkpoint import load_weights, save_weights
-from firenet_jax.commands import reconstruct as pipeline
+from firenet_jax.commands import jobs, reconstruct
 from firenet_jax.commands.reconstruct import Reconstruct, describe, plan, run
 from firenet_jax.errors import RecordingError
 from firenet_jax.network import Weights, initial_params
@@ -144,7 +144,7 @@ def interrupt_after(monkeypatch, pictures):
 def unfinished(weights, recording, output, monkeypatch):
     """A run that was interrupted after nine pictures."""
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "RESUME_EVERY", 0)
+        patch.setattr(jobs, "RESUME_EVERY", 0)
         interrupt_after(patch, 9)
         with pytest.raises(Interrupted):
             run(settings(weights, (recording,), output))
@@ -157,7 +157,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, weights, monkey
     choices = {"display": Display(auto_range=True), "network": Network(color=color)}
     run(settings(weights, (recording,), tmp_path / "whole", **choices))
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "RESUME_EVERY", 0)
+        patch.setattr(jobs, "RESUME_EVERY", 0)
         interrupt_after(patch, at)
         with pytest.raises(Interrupted):
             run(settings(weights, (recording,), tmp_path / "out", **choices))
@@ -181,7 +181,7 @@ def test_other_settings_do_not_continue_an_unfinished_run(tmp_path, weights, mon
     recording = write_recording(tmp_path / "a.txt")
     unfinished(weights, recording, tmp_path / "out", monkeypatch)
     other = {"windows": Windows(events=200)}
-    with pytest.raises(ValueError, match="unfinished run of other settings"):
+    with pytest.raises(ValueError, match="windows.events was 100, now 200"):
         run(settings(weights, (recording,), tmp_path / "out", **other))
     run(settings(weights, (recording,), tmp_path / "out", overwrite=True, **other))
     assert len(pictures_of(tmp_path / "out")[0]) == 15
@@ -211,15 +211,15 @@ def test_killed_and_run_again_gives_the_same(tmp_path, weights):
     script = textwrap.dedent(f"""
         import os, signal, sys
         from firenet_jax import cli
-        from firenet_jax.commands import reconstruct as pipeline
-        pipeline.RESUME_EVERY = 0
+        from firenet_jax.commands import jobs
+        jobs.RESUME_EVERY = 0
         if sys.argv[1] == "kill":
-            write = pipeline.FolderWriter.write
+            write = jobs.FolderWriter.write
             def killed(self, *args):
                 if self.count == 90:
                     os.kill(os.getpid(), signal.SIGKILL)
                 write(self, *args)
-            pipeline.FolderWriter.write = killed
+            jobs.FolderWriter.write = killed
         out = sys.argv[2]
         sys.exit(cli.main(["reconstruct", {str(recording)!r}, "-o", out,
                            "--weights", {str(weights)!r}, "-N", "100"]))
@@ -265,7 +265,7 @@ def test_a_damaged_recording_does_not_keep_others_from_being_done(
     names = "early", "good", "late", "fine"
     paths = [write_recording(tmp_path / f"{name}.txt", 900, seed=3) for name in names]
     (tmp_path / "early.txt").write_text(f"{WIDTH} {HEIGHT}\n0.5 1 1 1 1\n")
-    whole = pipeline.cut
+    whole = jobs.cut
 
     def cut(recording, *args):
         for number, window in enumerate(whole(recording, *args)):
@@ -273,7 +273,7 @@ def test_a_damaged_recording_does_not_keep_others_from_being_done(
                 raise RecordingError(f"{recording.path}: damaged")
             yield window
 
-    monkeypatch.setattr(pipeline, "cut", cut)
+    monkeypatch.setattr(jobs, "cut", cut)
     with pytest.raises(RecordingError) as raised:
         run(settings(weights, tuple(paths), tmp_path / "all", batch=batch))
     said = str(raised.value)
@@ -285,7 +285,7 @@ def test_a_damaged_recording_does_not_keep_others_from_being_done(
     left = {path.name for path in (tmp_path / "all").iterdir()}
     assert left == {"good", "fine", "late.partial", "good.done.json", "fine.done.json"}
     # mended, they are done by the same command, the others are not done again
-    monkeypatch.setattr(pipeline, "cut", whole)
+    monkeypatch.setattr(jobs, "cut", whole)
     write_recording(tmp_path / "early.txt", 900, seed=3)
     run(settings(weights, tuple(paths), tmp_path / "all", batch=batch))
     assert {path.name for path in (tmp_path / "all").iterdir()} == set(names)
@@ -305,7 +305,7 @@ def test_an_interrupted_run_of_several_goes_on(tmp_path, weights, monkeypatch, c
         write(self, *args)
 
     monkeypatch.setattr(FolderWriter, "write", counted)
-    monkeypatch.setattr(pipeline, "RESUME_EVERY", 0)
+    monkeypatch.setattr(jobs, "RESUME_EVERY", 0)
     with pytest.raises(Interrupted):
         run(settings(weights, paths, tmp_path / "out", batch=1))
     written += ["-"] * 100
@@ -382,7 +382,7 @@ def test_the_hot_pixels_of_a_file_not_its_name_are_what_a_run_goes_on_with(
     recording, hot = write_recording(tmp_path / "a.txt"), tmp_path / "hot.txt"
     hot.write_text("1,1\n")
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "RESUME_EVERY", 0)
+        patch.setattr(jobs, "RESUME_EVERY", 0)
         interrupt_after(patch, 9)
         with pytest.raises(Interrupted):
             run(settings(weights, (recording,), tmp_path / "out", hot_pixels=str(hot)))
@@ -523,7 +523,7 @@ def test_folders_keep_the_dots_in_their_names(tmp_path):
 
 def test_what_a_run_keeps_for_another_is_true_and_does_not_stay(tmp_path, weights, monkeypatch):
     """Pictures and times that it says are done are on disk by then."""
-    monkeypatch.setattr(pipeline, "RESUME_EVERY", 0)
+    monkeypatch.setattr(jobs, "RESUME_EVERY", 0)
     replace, published = os.replace, []
 
     def seen(source, target):
@@ -561,7 +561,7 @@ def test_a_second_run_into_a_folder_touches_nothing(tmp_path, weights, monkeypat
     (partial / "resume.12.npz").write_bytes(b"of the first run, not published yet")
     before = {path.name: path.read_bytes() for path in partial.iterdir()}
     if not seen:  # the second asks for the lock later, in another place
-        monkeypatch.setattr(pipeline, "check_free", lambda path: None)
+        monkeypatch.setattr(reconstruct, "check_free", lambda path: None)
     for output in (out, tmp_path / "out.mp4"):
         if output.suffix:
             (tmp_path / "out.partial.mp4").write_bytes(b"half")

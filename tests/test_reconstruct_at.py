@@ -17,8 +17,8 @@ from test_pipeline import (
 )
 
 from firenet_jax.checkpoint import load_weights
-from firenet_jax.commands import reconstruct as pipeline
-from firenet_jax.commands.reconstruct import run
+from firenet_jax.commands import jobs
+from firenet_jax.commands.reconstruct import Reconstruct, run
 from firenet_jax.commands.times import Times
 from firenet_jax.errors import RecordingError
 from firenet_jax.instants import grid
@@ -27,6 +27,7 @@ from firenet_jax.pictures import Display, display, initial_display_state
 from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import images_at
 from firenet_jax.storage.video import FolderWriter
+from firenet_jax.windows import Windows
 
 
 def stamps_of(folder):
@@ -80,7 +81,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, weights, monkey
     choices = {"times": Times(rate=29.0), "display": Display(auto_range=True), "names": names}
     run(settings(weights, (recording,), tmp_path / "whole", **choices))
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "RESUME_EVERY", 0)
+        patch.setattr(jobs, "RESUME_EVERY", 0)
         interrupt_after(patch, 13)
         with pytest.raises(Interrupted):
             run(settings(weights, (recording,), tmp_path / "out", **choices))
@@ -136,8 +137,8 @@ def test_times_outside_of_a_recording(tmp_path, weights, caplog):  # noqa: F811
 @pytest.mark.parametrize(
     "choice, said",
     [
-        ({"windows": pipeline.Windows(between_frames=True)}, "not between frames"),
-        ({"windows": pipeline.Windows(events=9, step=3)}, "do not overlap"),
+        ({"windows": Windows(between_frames=True)}, "not between frames"),
+        ({"windows": Windows(events=9, step=3)}, "do not overlap"),
         ({"times": Times(), "names": "nanoseconds"}, "where it is chosen"),
         ({"topic": "a b"}, "topic is"),
         ({"preview": True, "output": "a.h5"}, "as the network gives them"),
@@ -152,7 +153,7 @@ def test_impossible_settings(tmp_path, weights, choice, said):  # noqa: F811
 
 def test_real_frames_have_images_at_their_times(tmp_path, recordings):
     """Those of the Event Camera Dataset, of which the first comes before the events."""
-    run(pipeline.Reconstruct((recordings / "ecd_slider_depth",), tmp_path / "out",
+    run(Reconstruct((recordings / "ecd_slider_depth",), tmp_path / "out",
         times=Times(between_frames=True), stop=0.08))  # fmt: skip
     times = open_recording(recordings / "ecd_slider_depth").frames.times
     assert stamps_of(tmp_path / "out")[:, 1].tolist() == times[1:3].tolist()

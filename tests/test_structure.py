@@ -92,8 +92,6 @@ def test_computing_never_imports_presenting():
 
 LINES, PARAMETERS = 60, 7
 LARGER = {  # function: why
-    "commands.reconstruct.reconstruct_jobs": "three threads share its slots",
-    "commands.reconstruct.run": "what is checked before the first recording is read",
     "readers.open_recording": "its docstring is what users read",
     "readers.arrays.recording": "one option a fact that no file says",
     "reconstruction.reconstruct_at": "what `reconstruct` takes, and the instants",

@@ -123,6 +123,16 @@ def test_frames_on_another_clock_are_refused(frames, events):
         list(cut(recording, Windows(between_frames=True)))
 
 
+@pytest.mark.parametrize("after, refused", [(3_600_000_000, False), (3_600_000_001, True)])
+def test_an_hour_is_not_another_clock(after, refused):
+    found = cut(recording_of([0, 5], frames=[after, 2 * after]), Windows(between_frames=True))
+    if refused:
+        with pytest.raises(RecordingError, match="not on one clock"):
+            list(found)
+    else:
+        assert [window.time for window in found] == [5]
+
+
 def test_frames_all_at_one_time_are_too_few():
     with pytest.raises(RecordingError, match="each at a time of its own"):
         cut(recording_of(range(20), frames=[5, 5, 5]), Windows(between_frames=True))
@@ -164,10 +174,14 @@ def test_a_step_beyond_the_window_would_lose_events(fields):
         cut(recording_of(range(9)), Windows(**fields))
 
 
-@pytest.mark.parametrize("count, said", [(9, "fewer than 0.1"), (35, ""), (151, "more than 1.5")])
+@pytest.mark.parametrize(
+    "count, said", [(9, "9 events per window are 0.09 per pixel"), (10, ""), (35, ""), (150, ""),
+                    (151, "are 1.51 per pixel"), (12_345, "are 123 per pixel")],
+)  # fmt: skip
 def test_unusual_windows_are_said(caplog, count, said):
     cut(recording_of([], height=10, width=10), Windows(events=count))
     assert said in caplog.text and bool(said) == bool(caplog.text)
+    assert not said or "0.35 (35 events) is usual" in caplog.text
 
 
 def test_windows_far_larger_than_chunks_cost_linear_time():
