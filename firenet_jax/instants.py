@@ -35,6 +35,7 @@ class Step(NamedTuple):
     events: Events
     time: int | None  # int64 us, of an image; None: the state is kept and no image wanted
     share: float  # of the way from the state before the last one kept to that one
+    new: int = 0  # of an image's events, the last so many: those since the last step that was kept
 
 
 @dataclass
@@ -131,7 +132,8 @@ def _look(
             share = max(share, (time - begin) / (1000 * windows.longest))
     share = min(share, 1.0) if len(before) else 1.0
     left_out = min(int(share * len(before)), len(before))
-    return Step(concatenate([before.select(slice(left_out, None)), passed]), time, share)
+    events = concatenate([before.select(slice(left_out, None)), passed])
+    return Step(events, time, share, len(passed))
 
 
 class Grid:
