@@ -1,5 +1,7 @@
 """Images and pictures in other files, read back by the libraries of these formats."""
 
+import sqlite3
+
 import h5py
 import numpy as np
 import pytest
@@ -82,6 +84,25 @@ def test_bags_are_replaced_whole_or_left_out(tmp_path, name):
     other.write(pictures()[0], 7)
     other.abandon()
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("place", ["open", "write", "close"])
+def test_a_full_disk_leaves_no_bag_of_ros_2(tmp_path, monkeypatch, place):
+    """Its database has a kind of error of its own."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    original = getattr(rosbag2.Writer, place)
+
+    def full(self, *args, **kwargs):
+        if place == "open":
+            original(self)
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr(rosbag2.Writer, place, full)
+    writer = BagWriter(tmp_path / "images.ros2", "/image", "cam0")
+    with pytest.raises(OutputError, match=r"cannot write \(database or disk is full\)"):
+        write(writer, pictures())
+    writer.abandon()
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_a_bag_cannot_say(tmp_path):

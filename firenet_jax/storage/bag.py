@@ -12,6 +12,7 @@ import importlib
 import os
 import re
 import shutil
+import sqlite3
 from pathlib import Path
 
 import numpy as np
@@ -59,14 +60,13 @@ class BagWriter:
         """At the first picture: a database serves the thread that opened it and no other."""
         _remove(self.partial, self.path)  # of a run that was killed
         choice = {"version": 9} if self.ros2 else {}
-        bag = self.library.Writer(self.partial, **choice)
-        bag.open()
-        self.bag = bag
+        self.bag = self.library.Writer(self.partial, **choice)
+        self.bag.open()
         if os.name != "nt":  # no locks there, and folders cannot be opened
             handle = os.open(self.partial, os.O_RDONLY)
             self.holding.callback(os.close, handle)
             lock(handle, self.path)
-        self.connection = bag.add_connection(self.topic, IMAGE, typestore=self.types)
+        self.connection = self.bag.add_connection(self.topic, IMAGE, typestore=self.types)
 
     def write(self, picture: np.ndarray, time: int, events: int = 0) -> None:
         """picture: (H, W) or (H, W, 3) uint8; time: microseconds."""
@@ -92,14 +92,14 @@ class BagWriter:
             data=np.ascontiguousarray(picture).reshape(-1),
         )
         serialise = self.types.serialize_cdr if self.ros2 else self.types.serialize_ros1
-        with writing(self.path):
+        with _writing(self.path):
             if self.bag is None:
                 self._start()
             self.bag.write(self.connection, 1000 * time, serialise(message, IMAGE))
         self.count += 1
 
     def finish(self) -> None:
-        with writing(self.path):
+        with _writing(self.path):
             self.bag.close()
             _remove(self.path, self.path)
             self.partial.rename(self.path)
@@ -119,6 +119,16 @@ class BagWriter:
             else:
                 self.partial.unlink()
         self.holding.close()
+
+
+@contextlib.contextmanager
+def _writing(path: Path):
+    """As `writing`, where a full disk may be the database's own kind of error."""
+    with writing(path):
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise OSError(str(error)) from error
 
 
 def _remove(place: Path, name: Path) -> None:
