@@ -38,6 +38,33 @@ def test_arrays_hold_images_times_and_events(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["images.h5"]
 
 
+class Full:
+    """A disk with room for so many bytes."""
+
+    def __init__(self, file, room):
+        self.file, self.room = file, room
+
+    def write(self, data):
+        self.room -= len(data)
+        if self.room < 0:
+            raise OSError(28, "No space left on device")
+        return self.file.write(data)
+
+    def __getattr__(self, name):
+        return getattr(self.file, name)
+
+
+@pytest.mark.parametrize("room", [0, 500, 4000, 9000])
+def test_a_full_disk_leaves_no_arrays(tmp_path, room):
+    """HDF5, left to itself, ended the process."""
+    writer = ArraysWriter(tmp_path / "images.h5")
+    writer.disk.file = Full(writer.disk.file, room)
+    with pytest.raises(OutputError, match=r"cannot write \(No space left on device\)"):
+        write(writer, pictures(height=20, width=30).astype(np.float32))
+    writer.abandon()
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("name", ["images.bag", "images.ros2"])
 @pytest.mark.parametrize("colours", [False, True])
 def test_bags_are_read_back(tmp_path, name, colours):

@@ -73,8 +73,9 @@ def writing(path: Path):
 
 def _reason(error: OSError) -> str:
     """HDF5 tells it in the midst of two lines, with the time and an address in memory."""
-    told = re.search(r"error message = '([^']+)'", str(error))
-    return error.strerror or (told[1] if told else " ".join(str(error).split()))
+    text = error.strerror or str(error)
+    told = re.search(r"error message = '([^']+)'", text)
+    return told[1] if told else " ".join(text.split())
 
 
 def lock(handle: int, path: Path) -> None:
