@@ -20,6 +20,8 @@ def check_span(start: float | None, stop: float | None) -> None:
     for name, value in (("start", start), ("stop", stop)):
         if value is not None and not abs(value) < LATEST / 1e6:
             raise SettingsError(f"{name} is {value} s, but must be a time: leave it out for none")
+    if start is not None and start < 0:
+        raise SettingsError(f"start is {start} s, but counts from the beginning: 0 or more")
     if stop is not None and stop <= (start or 0):
         raise SettingsError(f"stop is {stop} s, but must come after the start")
 

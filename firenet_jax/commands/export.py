@@ -107,7 +107,8 @@ def simulated(height: int, width: int, seconds: float) -> Iterator[Events]:
 def write_file(settings: Export) -> None:
     path = settings.output
     if path.suffix not in KINDS:
-        raise OutputError(f"{path}: cannot write {path.suffix or 'such'} files; try {KINDS}")
+        names = f"{', '.join(KINDS[:-1])} or {KINDS[-1]}"
+        raise OutputError(f"{path}: cannot write {path.suffix or 'such'} files; try {names}")
     runs = path.suffix in (".onnx", ".stablehlo")
     if not runs and (settings.picture or not settings.normalise):
         raise OutputError(
