@@ -98,7 +98,8 @@ def read_hot_pixels(path: str | Path, height: int, width: int) -> np.ndarray:
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: cannot read this list of hot pixels: {error}") from error
+        reason = getattr(error, "strerror", None) or "it is no text"
+        raise RecordingError(f"{path}: cannot read this list of hot pixels: {reason}") from error
     for number, line in enumerate(lines, 1):
         if not line.strip():
             continue
