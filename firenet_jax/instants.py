@@ -65,7 +65,7 @@ def steps(
     """
     check(windows)
     counts = Counts() if counts is None else counts
-    times = iter(times)
+    endless, times = isinstance(times, Grid), _in_order(times)
     time = next(times, None)
     before = Events.empty()
     for window, begin, end in _spans(windows, cut(recording, windows, chunks)):
@@ -78,8 +78,18 @@ def steps(
             time = next(times, None)
         yield Step(window.events, None, 1.0)
         before = window.events
-    if time is not None and not isinstance(times, Grid):
+    if time is not None and not endless:
         counts.late += 1 + sum(1 for _ in times)
+
+
+def _in_order(times: Iterable[int]) -> Iterator[int]:
+    """Raises SettingsError where they are not: what came before is gone."""
+    last = None
+    for time in times:
+        if last is not None and time < last:
+            raise SettingsError(f"times of images come in order, but {time} us after {last} us")
+        yield time
+        last = time
 
 
 def check(windows: Windows) -> None:

@@ -159,6 +159,8 @@ def step(
     tensor must be finite there too: zeros, for instance).
     dtype: of the convolutions; jnp.bfloat16 trades accuracy for speed on accelerators.
     """
+    if isinstance(params, Weights):
+        raise TypeError("step takes the parameters alone: pass weights.params")
     return FireNet(dtype).apply({"params": params}, state, event_tensor, exists)
 
 
