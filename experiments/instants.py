@@ -1,15 +1,19 @@
 """Images at a camera's frame times: better than one window of each gap? And do they flicker?
 
 For each recording with frames: SSIM and MSE of images against the frames, of one window from frame
-to frame and of images at given times, on the same frames; where a camera stands still also where
-events are. Flicker: the mean second difference in time, of as many images per second as there are
-windows, against the images of these windows; and the change between images 0.5 ms apart where a
-window is kept between them, against where none is.
+to frame and of images at given times, on the same frames; also where events are (all that counts
+where a camera stands still), and there after local equalisation. A recording with many frames is
+measured again with every third of them, as from a slower camera: where frames come as far apart as
+windows last at most, both ways give the network nearly the same windows. Flicker: the mean second
+difference in time, of as many images per second as there are windows, against the images of these
+windows; and the change between images 0.5 ms apart where a window is kept between them, against
+where none is.
 
-    python experiments/instants.py RECORDING...            about 1 minute each
+    python experiments/instants.py RECORDING...            1 to 2 minutes each
 """
 
 import argparse
+import dataclasses
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -20,12 +24,16 @@ from skimage.metrics import structural_similarity
 
 import firenet_jax as fj
 from firenet_jax.evaluation import metrics
-from firenet_jax.events import concatenate
+from firenet_jax.evaluation.equalise import equalise
+from firenet_jax.events import Frames, concatenate
 from firenet_jax.reconstruction import images_at
 from firenet_jax.windows import Windows, cut, in_words, usual
 
 NEAR = 40_000  # microseconds: events that say where something moves
 FINE = 500  # microseconds between neighbours
+MANY = 30  # frames
+NAMES = ("ssim", "mse", "ssim_moving", "mse_moving", "ssim_moving_equalised",
+         "mse_moving_equalised")  # fmt: skip
 
 
 def of_windows(weights, recording, windows: Windows) -> dict[int, np.ndarray]:
@@ -62,7 +70,12 @@ def score(image, frame, mask) -> list[float]:
     )[1]
     squares = (image - frame) ** 2
     whole = float(metrics.ssim(jnp.asarray(image), jnp.asarray(frame)))
-    return [whole, squares.mean(), similar[mask].mean(), squares[mask].mean()]
+    alike, same = equalise(np.stack([image, frame]), "local")
+    similar_alike = structural_similarity(
+        alike, same, data_range=1, gaussian_weights=True, use_sample_covariance=False, full=True
+    )[1]
+    return [whole, squares.mean(), similar[mask].mean(), squares[mask].mean(),
+            similar_alike[mask].mean(), ((alike - same) ** 2)[mask].mean()]  # fmt: skip
 
 
 def flicker(images: list[np.ndarray]) -> float:
@@ -71,29 +84,39 @@ def flicker(images: list[np.ndarray]) -> float:
     return float(np.mean([np.abs(a - 2 * b + c).mean() for a, b, c in threes]))
 
 
-def measure(weights, path: Path) -> dict:
-    recording = fj.open_recording(path)
-    events = concatenate(list(recording.events()))
-    windows, shape = usual(iter([events])), (recording.height, recording.width)
-    times = np.unique(recording.frames.times)
-    inside = times[(times >= events.t[0]) & (times <= events.t[-1])]
-
+def of_frames(weights, recording, events, kept: dict) -> dict:
+    """Both ways on the recording's frames; kept: the images at their times, which may be more."""
+    times, shape = recording.frames.times, (recording.height, recording.width)
     gaps = of_windows(weights, recording, Windows(between_frames=True))
     ends = np.array(sorted(gaps))  # of the last event before a frame
-    kept = at(weights, recording, windows, inside)
     rows = {"frame to frame": [], "at its time": []}
     for number, time in enumerate(times.tolist()):
-        if time not in kept:
+        if time not in kept or time < ends[0]:
             continue
         frame = recording.frames.read(number).astype(np.float32) / 255
         mask = moving(events, time, shape)
         last = ends[ends <= time].max()
         rows["frame to frame"].append(score(gaps[int(last)], frame, mask))
         rows["at its time"].append(score(kept[time], frame, mask))
-    found = {"windows": in_words(windows, recording.pixels), "frames": len(kept)}
-    names = ("ssim", "mse", "ssim_moving", "mse_moving")
+    apart = float(np.median(np.diff(times))) / 1000
+    found = {"frames": len(rows["at its time"]), "milliseconds_apart": apart}
     for name, values in rows.items():
-        found[name] = dict(zip(names, np.mean(values, 0).round(4).tolist(), strict=True))
+        found[name] = dict(zip(NAMES, np.mean(values, 0).round(4).tolist(), strict=True))
+    return found
+
+
+def measure(weights, path: Path) -> dict:
+    recording = fj.open_recording(path)
+    events = concatenate(list(recording.events()))
+    windows, frames = usual(iter([events])), recording.frames
+    inside = frames.times[(frames.times >= events.t[0]) & (frames.times <= events.t[-1])]
+    kept = at(weights, recording, windows, inside)
+    found = {"windows": in_words(windows, recording.pixels)}
+    found |= of_frames(weights, recording, events, kept)
+    if len(inside) > MANY:
+        thinned = Frames(frames.times[::3], lambda number: frames.read(3 * number))
+        third = dataclasses.replace(recording, frames=thinned)
+        found["every_third_frame"] = of_frames(weights, third, events, kept)
 
     full = of_windows(weights, recording, windows)
     ends = sorted(full)[3:25]

@@ -290,6 +290,14 @@ def _first_error(
     )
 
 
+def check_recording(recording) -> None:
+    """Raises TypeError for what is none, such as a path."""
+    if not isinstance(recording, Recording):
+        raise TypeError(
+            f"the recording is a {type(recording).__name__}: pass what open_recording gives"
+        )
+
+
 def until_damage(chunks: Iterable[Events]) -> Iterator[Events]:
     """Chunks up to damage, for a first look at a recording: whoever uses it will meet the error,
     or stop before. Raises it where there is nothing before."""

@@ -20,6 +20,8 @@ def check_span(start: float | None, stop: float | None) -> None:
     for name, value in (("start", start), ("stop", stop)):
         if value is not None and not abs(value) < LATEST / 1e6:
             raise SettingsError(f"{name} is {value} s, but must be a time: leave it out for none")
+    if start is not None and start < 0:
+        raise SettingsError(f"start is {start} s, but counts from the beginning: 0 or more")
     if stop is not None and stop <= (start or 0):
         raise SettingsError(f"stop is {stop} s, but must come after the start")
 
@@ -96,7 +98,8 @@ def read_hot_pixels(path: str | Path, height: int, width: int) -> np.ndarray:
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: cannot read this list of hot pixels: {error}") from error
+        reason = getattr(error, "strerror", None) or "it is no text"
+        raise RecordingError(f"{path}: cannot read this list of hot pixels: {reason}") from error
     for number, line in enumerate(lines, 1):
         if not line.strip():
             continue

@@ -35,6 +35,7 @@ class Step(NamedTuple):
     events: Events
     time: int | None  # int64 us, of an image; None: the state is kept and no image wanted
     share: float  # of the way from the state before the last one kept to that one
+    new: int = 0  # of an image's events, the last so many: those since the last step that was kept
 
 
 @dataclass
@@ -64,7 +65,7 @@ def steps(
     """
     check(windows)
     counts = Counts() if counts is None else counts
-    times = iter(times)
+    endless, times = isinstance(times, Grid), _in_order(times)
     time = next(times, None)
     before = Events.empty()
     for window, begin, end in _spans(windows, cut(recording, windows, chunks)):
@@ -77,8 +78,18 @@ def steps(
             time = next(times, None)
         yield Step(window.events, None, 1.0)
         before = window.events
-    if time is not None and not isinstance(times, Grid):
+    if time is not None and not endless:
         counts.late += 1 + sum(1 for _ in times)
+
+
+def _in_order(times: Iterable[int]) -> Iterator[int]:
+    """Raises SettingsError where they are not: what came before is gone."""
+    last = None
+    for time in times:
+        if last is not None and time < last:
+            raise SettingsError(f"times of images come in order, but {time} us after {last} us")
+        yield time
+        last = time
 
 
 def check(windows: Windows) -> None:
@@ -131,7 +142,8 @@ def _look(
             share = max(share, (time - begin) / (1000 * windows.longest))
     share = min(share, 1.0) if len(before) else 1.0
     left_out = min(int(share * len(before)), len(before))
-    return Step(concatenate([before.select(slice(left_out, None)), passed]), time, share)
+    events = concatenate([before.select(slice(left_out, None)), passed])
+    return Step(events, time, share, len(passed))
 
 
 class Grid:

@@ -158,6 +158,8 @@ def step(
     tensor must be finite there too: zeros, for instance).
     dtype: of the convolutions; jnp.bfloat16 trades accuracy for speed on accelerators.
     """
+    if isinstance(params, Weights):
+        raise TypeError("step takes the parameters alone: pass weights.params")
     network: Any = FireNet(dtype)  # flax does not say what `apply` returns
     return network.apply({"params": params}, state, event_tensor, exists)
 

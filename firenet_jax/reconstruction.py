@@ -18,7 +18,7 @@ from jax.sharding import Mesh
 
 from firenet_jax import colour, native
 from firenet_jax.devices import BATCH, REPLICATED, TIME_BATCH, on_each_device
-from firenet_jax.events import Events, Recording
+from firenet_jax.events import Events, Recording, check_recording
 from firenet_jax.instants import Step, steps
 from firenet_jax.network import (
     BINS,
@@ -142,7 +142,18 @@ _quickest.defvjp(_forward, _backward)
 
 
 def _checked(weights: Weights, state: State, tensors, valid):
-    """All of `reconstruct`'s arrays in float32; raises ValueError where they do not fit."""
+    """All of `reconstruct`'s arrays in float32; raises ValueError where they do not fit, TypeError
+    for what is no weights or state."""
+    if not isinstance(weights, Weights):
+        raise TypeError(
+            f"weights are a {type(weights).__name__}: pass Weights, as load_weights gives, whole "
+            "and not their params"
+        )
+    if not isinstance(state, State):
+        raise TypeError(
+            f"the state is a {type(state).__name__}: make it with initial_state(batch, height, "
+            "width)"
+        )
     if jnp.ndim(tensors) != 5 or jnp.shape(tensors)[-1] != BINS:
         raise ValueError(f"event tensors are (T, B, H, W, {BINS}), not {jnp.shape(tensors)}")
     shape = jnp.shape(tensors)[:4]
@@ -311,6 +322,7 @@ def images_at(
     """
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but must be 1 or more steps")
+    check_recording(recording)
     chosen = Windows(**windows) if windows else usual(recording.events())
     height, width, size = recording.height, recording.width, 0
     state = initial_state(1, height, width)

@@ -24,7 +24,7 @@ import numpy as np
 
 from firenet_jax.devices import BATCH, TIME_BATCH
 from firenet_jax.errors import SettingsError
-from firenet_jax.events import BINS, Events, Recording
+from firenet_jax.events import BINS, Events, Recording, check_recording
 from firenet_jax.windows import Windows, cut
 
 # A flat list of events is padded to one of these sizes: at most 8 times too long, at a few ns
@@ -252,6 +252,7 @@ def event_tensors(
     """
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but must be 1 or more windows")
+    check_recording(recording)
     size = 0
     for group in in_groups(cut(recording, Windows(**windows)), chunk):
         rows = [[window.events] for window in group]

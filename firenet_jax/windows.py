@@ -52,28 +52,32 @@ class Windows:
     def __post_init__(self):
         ways = [self.events, self.events_per_pixel, self.duration, self.between_frames or None]
         if sum(way is not None for way in ways) > 1:
-            raise ValueError(
+            raise SettingsError(
                 "windows are cut in one way: choose one of --events, --events-per-pixel, "
                 "--duration and --frame-to-frame"
             )
         for name in ("events", "events_per_pixel", "duration", "step", "longest"):
             value = getattr(self, name)
             if value is not None and not 0 < value <= MOST:
-                raise ValueError(f"{name} is {value}, but must be more than 0, at most {MOST}")
+                raise SettingsError(f"{name} is {value}, but must be more than 0, at most {MOST}")
         if self.step is not None:
             if self.between_frames:
-                raise ValueError("step overlaps windows of a fixed size, not those between frames")
+                raise SettingsError(
+                    "step overlaps windows of a fixed size, not those between frames"
+                )
             if self.duration is None and self.step != int(self.step):
-                raise ValueError(f"step is {self.step}, but counts events: pass a whole number")
+                raise SettingsError(f"step is {self.step}, but counts events: pass a whole number")
             if self.duration is not None and round(self.step * 1000) < 1:
-                raise ValueError(f"step is {self.step} ms, but times are whole microseconds")
+                raise SettingsError(f"step is {self.step} ms, but times are whole microseconds")
         if self.longest is not None:
             if self.duration is not None or self.between_frames or self.step is not None:
-                raise ValueError("longest limits windows of events, which do not overlap")
+                raise SettingsError("longest limits windows of events, which do not overlap")
             if round(self.longest * 1000) < 1:
-                raise ValueError(f"longest is {self.longest} ms, but times are whole microseconds")
+                raise SettingsError(
+                    f"longest is {self.longest} ms, but times are whole microseconds"
+                )
         if self.duration is not None and round(self.duration * 1000) < 1:
-            raise ValueError(f"duration is {self.duration} ms, but times are whole microseconds")
+            raise SettingsError(f"duration is {self.duration} ms, but times are whole microseconds")
 
     def count(self, pixels: int) -> int:
         """Events in a full window of a sensor with this many pixels, unless time decides."""

@@ -6,15 +6,18 @@ Input number n is a function of the seed, n and `--only`: `--first N --count 1` 
 Inputs are small files of every format, written here, and with FIRENET_RECORDINGS and
 FIRENET_REFERENCE set real ones, or their beginnings. Refusing is a FirenetError or OSError whose
 message is one line; anything else is a fault of ours: another exception, a process that ends
-(inputs are read in a worker, which is started again), more than 8 GB, more than a minute.
+(inputs are read in a worker, which is started again), more than 8 GB, more than a minute of the
+processor's time (not of the clock: a busy machine changes nothing), or ten minutes asleep.
 """
 
 import argparse
 import collections
 import contextlib
+import gzip
 import json
 import logging
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -26,7 +29,8 @@ import numpy as np
 
 from firenet_jax.errors import FirenetError
 
-SLOW = 60.0  # seconds
+SLOW = 60.0  # seconds of the processor's time
+ASLEEP = 600.0  # seconds of the clock
 AT_ONCE = 500  # inputs that one worker reads: libraries keep a little of what they have opened
 NASTY = [
     b"nan", b"-1", b"1e999", b"9" * 400, "١٢٣".encode(), b"\x0c", b"\x00", b"\xff\xfe", b"0x10",
@@ -44,6 +48,7 @@ def inputs(folder: Path) -> dict[str, Path]:
     from PIL import Image
 
     from firenet_jax.checkpoint import save_weights
+    from firenet_jax.live.sources import BINARY
     from firenet_jax.network import Weights
     from firenet_jax.storage.video import write_video
 
@@ -102,11 +107,19 @@ def inputs(folder: Path) -> dict[str, Path]:
     Image.fromarray(rng.integers(0, 256, (40, 50, 3), np.uint8)).save(folder / "picture.png")
     Image.fromarray(rng.integers(0, 256, (40, 50, 3), np.uint8)).save(folder / "picture.jpg")
     found |= {name: folder / name for name in ("picture.png", "picture.jpg")}
+    _arrays(folder, found, t, x, y, p)
+    made("a.txt.gz", gzip.compress(text.encode(), mtime=0))
+    made("settings.json", json.dumps({"steps": 30, "batch": {"size": 2, "names": ["a"]}}).encode())
+    made("wire.text", text.partition("\n")[2].encode())
+    for name, kind in BINARY.items():
+        made(f"wire.{name}", np.zeros(40, kind).tobytes())
+    made("times.txt", "".join(f"{k / 30:.6f} 0.1 0.2\n" for k in range(30)).encode())
+    made("stamps.csv", b"#timestamp [ns],filename\n33300000,a.png\n66600000,b.png\n")
     entry = {"step": 1, "kind": "validation", "loss": 0.5, "seconds": 1.0}
     made("log.jsonl", "".join(json.dumps(entry | {"step": k}) + "\n" for k in range(20)).encode())
     if samples := os.environ.get("FIRENET_RECORDINGS"):
         beginnings = {"davis346_frames.aedat4": None, "dvxplorer_face.aedat4": 60_000,
-                      "ros1_event_camera_msgs.bag": 200_000, "evt2_sparklers.raw": 20_000,
+                      "ros1_event_camera_msgs.bag": None, "evt2_sparklers.raw": 20_000,
                       "dvs_synthetic_sweep.es": 20_000, "davis346_59_frames.aedat4": 150_000,
                       "evt3_driving.raw": 20_000, "davis240_boxes.aedat": 200_000,
                       "ros2_mcap/test_events_2_0.mcap": 200_000}  # fmt: skip
@@ -118,6 +131,37 @@ def inputs(folder: Path) -> dict[str, Path]:
             if path.stat().st_size < 1 << 20:
                 made(path.name, path.read_bytes())
     return found
+
+
+def _arrays(folder: Path, found: dict[str, Path], t, x, y, p) -> None:
+    """numpy's files of one array and of several; HDF5 of DSEC, MVSEC, v2e and Metavision."""
+    import h5py
+
+    names = {"t": t, "x": x, "y": y, "p": p}
+    fields = np.zeros(len(t), [("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "?")])
+    for name, column in names.items():
+        fields[name] = column
+    rows = np.stack([t, x, y, p], 1)
+    np.save(folder / "rows.npy", rows)
+    np.save(folder / "fields.npy", fields)
+    np.savez_compressed(folder / "events.npz", **names)
+    with h5py.File(folder / "dsec.h5", "w") as file:
+        file["t_offset"] = 5
+        for name, column in names.items():
+            file.create_dataset(f"events/{name}", data=column, compression="gzip")
+    with h5py.File(folder / "mvsec.h5", "w") as file:
+        file["davis/left/events"] = np.stack([x, y, t / 1e6, 2 * p - 1], 1)
+        file["davis/left/image_raw"] = np.zeros((2, 20, 24), np.uint8)
+        file["davis/left/image_raw_ts"] = [0.1, 0.5]
+    with h5py.File(folder / "v2e.h5", "w") as file:
+        file.create_dataset("events", data=rows.astype(np.uint32), chunks=True, compression="gzip")
+    with h5py.File(folder / "metavision.h5", "w") as file:
+        file["CD/events"] = fields
+        file.attrs["geometry"] = "24x20"
+    for path in folder.iterdir():
+        if path.name in ("rows.npy", "fields.npy", "events.npz", "dsec.h5", "mvsec.h5", "v2e.h5",
+                         "metavision.h5"):  # fmt: skip
+            found[path.name] = path
 
 
 def _newer(made, t: list, x: list, y: list, p: list) -> None:
@@ -210,10 +254,13 @@ def read(name: str, path: Path) -> None:
     """As the program reads it."""
     from firenet_jax.checkpoint import load_weights
     from firenet_jax.commands import simulate as dataset
+    from firenet_jax.commands.times import read_times
     from firenet_jax.filters import read_hot_pixels
+    from firenet_jax.live import sources
     from firenet_jax.readers import open_recording
     from firenet_jax.simulation import textures
     from firenet_jax.storage.files import read_arrays
+    from firenet_jax.storage.runs import read_record
     from firenet_jax.training import batches
     from firenet_jax.training import log as training_log
 
@@ -228,7 +275,16 @@ def read(name: str, path: Path) -> None:
         )  # fmt: skip
     elif name == "resume.npz":
         read_arrays(path)
-    elif name.endswith((".npz", ".pth")):
+    elif name in ("times.txt", "stamps.csv"):
+        read_times(path)
+    elif name == "settings.json":
+        read_record(path, "remove it")
+    elif name.startswith("wire."):
+        data = path.read_bytes()
+        pieces = (data[start : start + 100] for start in range(0, len(data), 100))
+        for _ in sources.decoded(pieces, name.removeprefix("wire.")):
+            pass
+    elif name == "weights.npz" or name.endswith(".pth"):
         load_weights(path)
     elif name.startswith("clip"):
         for _ in dataset.read_clip(path):
@@ -299,6 +355,8 @@ def work(seed: int, first: int, count: int, only: str = "") -> None:
         resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
         for number in range(first, first + count):
             print(json.dumps([number, "begins", ""]), flush=True)
+            # All threads count, and code that never returns to Python is ended, too.
+            signal.setitimer(signal.ITIMER_PROF, SLOW)
             print(json.dumps([number, *one(seed, number, whole, inside)]), flush=True)
 
 
@@ -318,16 +376,14 @@ def run(seed: int, first: int, count: int, only: str = "") -> tuple[collections.
         watch = selectors.DefaultSelector()
         watch.register(worker.stdout, selectors.EVENT_READ)
         last, what = number, "ends the process"
-        started = False
         while True:
-            if not watch.select(SLOW if started else 10 * SLOW):
-                what = "takes more than a minute"
+            if not watch.select(ASLEEP):
+                what = "sleeps"
                 worker.kill()
                 break
             line = worker.stdout.readline()
             if not line:
                 break
-            started = True
             last, name, came = json.loads(line)
             if name == "begins":
                 continue
@@ -339,6 +395,8 @@ def run(seed: int, first: int, count: int, only: str = "") -> tuple[collections.
             if number % 1000 == 0:
                 print(number, dict(counts), file=sys.stderr, flush=True)
         code = worker.wait()
+        if code == -signal.SIGPROF:
+            what = "takes more than a minute"
         watch.close()
         worker.stdout.close()
         if number < end:

@@ -67,6 +67,7 @@ def test_they_become_tensors():
         ({"t": [], "x": [], "y": [], "p": []}, "holds no events"),
         ({"unit": "ns"}, "unit is 'ns', expected one of s, ms, us"),
         ({"width": 0}, "width is 0"), ({"height": 20.5}, "height is 20.5"),
+        ({"width": float("nan")}, "width is nan"), ({"height": "20"}, "height is 20, but"),
         ({"x": None, "y": None, "p": None}, "pass t, x, y and p, or one structured array"),
         ({"x": None}, "pass t, x, y and p"),
         ({"t": np.zeros(3, [("a", "i4")]), "x": None, "y": None, "p": None}, "has the fields a,"),
@@ -81,6 +82,24 @@ def test_what_cannot_be_is_refused_at_once(change, said):
 def test_columns_of_unequal_length_are_no_events():
     with pytest.raises(ValueError, match=r"columns differ in length: t \(3,\), x \(2,\)"):
         fj.Events.of([1, 2, 3], [0, 0], [0, 0], [1, 1])
+
+
+def test_what_is_passed_for_weights_and_state_is_told_apart():
+    weights, state = fj.load_weights(), fj.initial_state(1, 20, 24)
+    tensors = np.zeros((1, 1, 20, 24, 5), np.float32)
+    recording = fj.recording(T, X, Y, P, **SIZE)
+    for call, said in (
+        (lambda: fj.reconstruct(weights.params, state, tensors), "pass Weights, as load_weights"),
+        (lambda: fj.reconstruct(weights, None, tensors), "make it with initial_state"),
+        (lambda: fj.step(weights, state, tensors[0]), "pass weights.params"),
+        (lambda: next(fj.images_at(weights.params, recording, [25])), "pass Weights"),
+        (lambda: next(fj.images_at(weights, "a.txt", [25])), "pass what open_recording gives"),
+        (lambda: next(fj.event_tensors("a.txt")), "pass what open_recording gives"),
+    ):
+        with pytest.raises(TypeError, match=said):
+            call()
+    with pytest.raises(ValueError, match="come in order, but 21 us after 25 us"):
+        list(fj.images_at(weights, recording, [25, 21]))
 
 
 def test_version_and_a_short_repr_of_weights():

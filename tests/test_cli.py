@@ -304,6 +304,29 @@ def test_options_of_the_original_program_are_explained(here, capsys):
     assert code == 1 and "cannot write .txt2 files" in error
 
 
+@pytest.mark.parametrize(
+    "line, said",
+    [
+        (f"{RUN} -T 0", "duration is 0.0"), (f"{RUN} -N 5 -T 5", "windows are cut in one way"),
+        (f"{RUN} -N 5 --step 1.5", "pass a whole number"), (f"{RUN} --longest 0", "longest is 0.0"),
+        (f"{RUN} -T 5 --step 9", "longer than the window"), (f"{RUN} --start -1", "start is -1.0"),
+        (f"{RUN} --frame-to-frame --step 3", "not those between frames"),
+        (f"{RUN} --rate 0", "rate is 0"), (f"{RUN} --rate 5 --triggers", "choose one of --rate"),
+        ("evaluate a.txt -o out -N 0", "events is 0"),
+        ("evaluate a.txt -o out --start -2", "start is -2.0"),
+        ("live a.txt --replay --events-per-pixel 0", "events_per_pixel is 0.0"),
+        ("demo -o a.h5", "a.h5: pictures"), ("demo -o a.bag", "a.bag: pictures"),
+        ("export -o a.foo", "try .onnx, .stablehlo, .pth or .safetensors"),
+    ],
+)  # fmt: skip
+def test_settings_that_cannot_be_are_one_sentence(here, capsys, line, said):
+    code, _, error = firenet(capsys, line)
+    assert code == 1 and said in error and len(error.splitlines()) == 1, error
+    assert error.startswith("firenet: error: ") and {p.name for p in here.iterdir()} == {
+        "a.txt", "weights.npz"
+    }  # fmt: skip
+
+
 def test_colours_of_a_sensor_that_says_it_is_grey(here, capsys):
     words = np.array([[10, 1 | 2 << 14], [20, 3 | 4 << 14]], "<u4").tobytes()
     (here / "a.dat").write_bytes(b"% Version 2\n% Width 24\n% Height 20\n\x00\x08" + words)

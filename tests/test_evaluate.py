@@ -14,22 +14,28 @@ import pytest
 from skimage.metrics import structural_similarity
 
 from firenet_jax import cli
-from firenet_jax.checkpoint import save_weights
+from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.commands import evaluate, options
 from firenet_jax.commands.evaluate import Evaluate, displacement, interval, plan, run
 from firenet_jax.commands.simulate import Picture, write_sequence
+from firenet_jax.commands.times import Times
+from firenet_jax.errors import RecordingError
 from firenet_jax.evaluation import comparison, methods, metrics
 from firenet_jax.evaluation.baselines import e2vid
+from firenet_jax.evaluation.baselines.high_pass import HighPass
 from firenet_jax.evaluation.comparison import COMPARED, Gap, matched
-from firenet_jax.evaluation.methods import Missing, load, recurrent_unet
-from firenet_jax.evaluation.report import METRICS, _best, notes, steps
+from firenet_jax.evaluation.methods import Missing, filtered, load, recurrent_unet
+from firenet_jax.evaluation.report import METRICS, _best, notes
+from firenet_jax.evaluation.report import steps as ticks_of
 from firenet_jax.events import Events
+from firenet_jax.instants import steps
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.readers import open_recording
+from firenet_jax.reconstruction import images_at
 from firenet_jax.storage.files import OutputError
 from firenet_jax.storage.pytorch_file import CheckpointError
 from firenet_jax.tensors import normalise, pack, voxelise
-from firenet_jax.windows import Window
+from firenet_jax.windows import Window, Windows
 
 HEIGHT, WIDTH = 20, 28
 PERIOD = 40_000  # microseconds
@@ -311,6 +317,91 @@ def test_pictures_of_other_settings_are_not_shown_beside_a_gap(folder, tmp_path,
     assert [sequence.titles for sequence in shown] == [["events", "frame", "hf"]]
 
 
+# ---- Images at given times
+
+
+def at_times(folder, output, times, **changes):
+    choices = {"data": (folder / "data" / "a.h5",), "times": times, "methods": "firenet"}
+    return run(settings(folder, output, **(choices | changes)))
+
+
+def test_images_at_frame_times_are_those_of_images_at(folder, tmp_path):
+    recording = open_recording(folder / "data" / "a.h5")
+    times = recording.frames.times
+    for name, choice in (("usual", {}), ("events", {"events": 500}), ("ms", {"duration": 7.0})):
+        results = at_times(folder, tmp_path / name, Times(between_frames=True), **choice)
+        entry = results["sequences"]["a"]["methods"]["ours"]
+        # One step at a time, as here: where votes cancel, a sum in another order is not zero.
+        weights = load_weights(folder / "ours.npz")
+        found = list(images_at(weights, recording, times, chunk=1, **choice))
+        taken, images = (np.concatenate(column) for column in zip(*found, strict=True))
+        numbers = np.searchsorted(times, taken)
+        counting = numbers > 0  # as of windows between frames, which the first has none of
+        assert entry["frame_numbers"] == numbers[counting].tolist() == [1, 2, 3, 4, 5]
+        mse = [
+            np.mean((np.clip(image, 0, 1) - recording.frames.read(n) / 255) ** 2)
+            for n, image in zip(numbers[counting], images[counting], strict=True)
+        ]
+        assert entry["values"]["mse"] == pytest.approx(mse, abs=1e-6)
+
+
+def test_what_was_done_is_said_and_kept_apart(folder, tmp_path, capsys):
+    between = at_times(folder, tmp_path / "out", Times())
+    with pytest.raises(OutputError, match="images_at was None, now {'between_frames': True}"):
+        at_times(folder, tmp_path / "out", Times(between_frames=True))
+    looks = at_times(folder, tmp_path / "out", Times(between_frames=True), overwrite=True)
+    out, page = capsys.readouterr().out, (tmp_path / "out" / "index.html").read_text()
+    said = "images at the times of its frames"
+    assert said in out and said in page and said in looks["protocol"][0]
+    assert "--between-frames" in looks["command"]
+    assert looks["sequences"]["a"]["images"].startswith(f"{said}, the state by windows of 0.35 ")
+    assert between["sequences"]["a"]["images"] == "windows between frames"
+    assert between["means"]["over frames"] != looks["means"]["over frames"]
+
+
+def test_every_method_has_images_at_a_rate(folder, tmp_path):
+    """12.5 of them a second meet every second frame; a file of the same times gives the same."""
+    methods = {"methods": "firenet,e2vid,hf,mr", "stop": 0.16}
+    frames = Times(rate=12.5), Times(at=tmp_path / "times.txt", since="start")
+    (tmp_path / "times.txt").write_text("0 s\n0.08 s\n0.16 s\n")
+    by_rate, by_file = (
+        at_times(folder, tmp_path / f"{k}", times, **methods)["sequences"]["a"]["methods"]
+        for k, times in enumerate(frames)
+    )
+    for name in NAMES:
+        assert by_rate[name]["frame_numbers"] == [2, 4] and by_rate[name]["of"] == 4
+        assert by_rate[name]["values"] == by_file[name]["values"]
+
+
+def test_a_filter_of_single_events_looks_at_those_since_its_last_window(folder):
+    """So its images are of all events up to the time, whatever the windows that it took in."""
+    hf = filtered("hf", HighPass(adaptive_range=False))
+    recording = open_recording(folder / "data" / "a.h5")
+    (events,) = recording.events()
+    wanted = np.array([30_000, 31_000, 90_000])
+    for count in (300, 4000):
+        before = last = hf.initial(HEIGHT, WIDTH)
+        images = []
+        for step in steps(recording, Windows(events=count), wanted):
+            if step.time is None:
+                window = Window(step.events, int(step.events.t[-1]))
+                before, last = last, hf.step(last, window)[0]
+            else:
+                images.append(methods.look(hf, before, last, step))
+        for time, image in zip(wanted.tolist(), images, strict=True):
+            seen = events.select(events.t <= time)
+            expected = hf.step(hf.initial(HEIGHT, WIDTH), Window(seen, time))[1]
+            np.testing.assert_allclose(image, expected, atol=1e-4)
+
+
+def test_times_that_a_recording_does_not_have_are_a_gap(folder, tmp_path):
+    with pytest.raises(RecordingError, match="holds no triggers"):
+        at_times(folder, tmp_path / "out", Times(triggers=True))
+    with pytest.raises(RecordingError, match="cannot read this file of times"):
+        at_times(folder, tmp_path / "none", Times(at=tmp_path / "none.txt"))
+    assert not (tmp_path / "none").exists()
+
+
 # ---- What counts
 
 
@@ -508,6 +599,7 @@ def test_weights_that_are_not_there_or_not_finite(folder, tmp_path):
         ({"start": 3.0, "stop": 2.0}, "stop"), ({"stop": float("inf")}, "leave it out"),
         ({"start": float("nan")}, "start is nan"), ({"events": 0}, "events"),
         ({"events": 5, "duration": 5.0}, "one way"), ({"sensor_size": "240"}, "WIDTHxHEIGHT"),
+        ({"keep_ratio": 0.5, "times": Times(between_frames=True)}, "between frames only"),
     ],
 )  # fmt: skip
 def test_impossible_settings(folder, tmp_path, choice, message):
@@ -549,7 +641,7 @@ def test_nothing_recompiles_as_windows_vary(folder):
     [(0.1, 0.9, [0, 0.2, 0.4, 0.6, 0.8, 1.0]), (3, 3, None), (0, 0, None), (-5, 9, None)],
 )
 def test_ticks_are_few_round_and_enclose(low, high, expected):
-    ticks = steps(low, high)
+    ticks = ticks_of(low, high)
     assert 2 <= len(ticks) <= 7 and ticks[0] <= low and ticks[-1] >= high
     assert expected is None or ticks == pytest.approx(expected)
 

@@ -6,7 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firenet_jax.storage.files import OutputError, identity, read_arrays, write_arrays, write_text
+from firenet_jax.storage.files import (
+    OutputError,
+    identity,
+    read_arrays,
+    write_arrays,
+    write_text,
+    writing,
+)
 
 
 def test_what_was_written_is_read(tmp_path):
@@ -42,6 +49,21 @@ def test_what_is_in_the_way_is_named(tmp_path):
     (tmp_path / "a.partial.txt").mkdir()
     with pytest.raises(OutputError, match=r"a.txt: cannot write \(.*, .*a.partial.txt\)"):
         write_text(tmp_path / "a.txt", "new")
+
+
+def test_what_libraries_say_of_a_full_disk_is_one_line(tmp_path):
+    hdf5 = (
+        "Can't close file (file write failed: time = Mon Nov 23 22:37:05 2026\n, filename = "
+        "'a.h5', errno = 28, error message = 'No space left on device', buf = 0x56)"
+    )
+    for error, said in (
+        (OSError(hdf5), "No space left on device"), (OSError("one\ntwo"), "one two"),
+        (OSError(28, hdf5), "No space left on device"),
+        (OSError(28, "No space left on device"), "No space left on device"),
+    ):  # fmt: skip
+        with pytest.raises(OutputError) as told, writing(tmp_path / "a.h5"):
+            raise error
+        assert f"cannot write ({said}): nothing" in str(told.value)
 
 
 def test_damaged_arrays_are_named_whatever_is_wrong_with_them(tmp_path):

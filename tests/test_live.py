@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 
 from firenet_jax import cli
+from firenet_jax.commands import live
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Recording, concatenate
 from firenet_jax.live import sources
@@ -374,3 +375,22 @@ def test_it_ends_after_so_many_seconds(tmp_path, monkeypatch, capsys):
     arguments = "live a.txt --replay --speed 0.01 --seconds 1 --port 0"
     assert cli.main(arguments.split()) == 0
     assert time.monotonic() - begun < 25 and "events in" in capsys.readouterr().out
+
+
+def test_seconds_count_from_the_first_look_at_the_source(tmp_path, monkeypatch, capsys):
+    """On a busy machine compiling took them all, and none were left for events."""
+    monkeypatch.chdir(tmp_path)
+    write_text(tmp_path / "a.txt")
+    (tmp_path / "empty.txt").touch()
+
+    def slow(*args):
+        time.sleep(0.4)
+        yield from pictures(*args)
+
+    monkeypatch.setattr(live, "pictures", slow)
+    end = f"--sensor-size {WIDTH}x{HEIGHT} --wire text --seconds 0.3 --port 0"
+    assert cli.main(["live", "a.txt", *end.split()]) == 0
+    assert "of 6,000 events" in capsys.readouterr().out
+    assert cli.main(["live", "empty.txt", *end.split()]) == 0
+    said = capsys.readouterr().out
+    assert "0 pictures of 0 events" in said and "None" not in said

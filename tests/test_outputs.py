@@ -1,5 +1,7 @@
 """Images and pictures in other files, read back by the libraries of these formats."""
 
+import sqlite3
+
 import h5py
 import numpy as np
 import pytest
@@ -34,6 +36,33 @@ def test_arrays_hold_images_times_and_events(tmp_path):
         assert file["times"][:].tolist() == TIMES
         assert file["events"][:].tolist() == [100, 101, 102, 103, 104]
     assert [path.name for path in tmp_path.iterdir()] == ["images.h5"]
+
+
+class Full:
+    """A disk with room for so many bytes."""
+
+    def __init__(self, file, room):
+        self.file, self.room = file, room
+
+    def write(self, data):
+        self.room -= len(data)
+        if self.room < 0:
+            raise OSError(28, "No space left on device")
+        return self.file.write(data)
+
+    def __getattr__(self, name):
+        return getattr(self.file, name)
+
+
+@pytest.mark.parametrize("room", [0, 500, 4000, 9000])
+def test_a_full_disk_leaves_no_arrays(tmp_path, room):
+    """HDF5, left to itself, ended the process."""
+    writer = ArraysWriter(tmp_path / "images.h5")
+    writer.disk.file = Full(writer.disk.file, room)
+    with pytest.raises(OutputError, match=r"cannot write \(No space left on device\)"):
+        write(writer, pictures(height=20, width=30).astype(np.float32))
+    writer.abandon()
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["images.bag", "images.ros2"])
@@ -82,6 +111,25 @@ def test_bags_are_replaced_whole_or_left_out(tmp_path, name):
     other.write(pictures()[0], 7)
     other.abandon()
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("place", ["open", "write", "close"])
+def test_a_full_disk_leaves_no_bag_of_ros_2(tmp_path, monkeypatch, place):
+    """Its database has a kind of error of its own."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    original = getattr(rosbag2.Writer, place)
+
+    def full(self, *args, **kwargs):
+        if place == "open":
+            original(self)
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr(rosbag2.Writer, place, full)
+    writer = BagWriter(tmp_path / "images.ros2", "/image", "cam0")
+    with pytest.raises(OutputError, match=r"cannot write \(database or disk is full\)"):
+        write(writer, pictures())
+    writer.abandon()
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_a_bag_cannot_say(tmp_path):

@@ -3,8 +3,10 @@
 The protocol is EVREAL's for the paper's data: window i holds the events between frames i-1 and i;
 reconstruction begins 10 s before the part that counts; a prediction, which has the time of its
 window's last event, counts if that is within 1 ms of a frame (a window without events has the time
-of its end). Frames and predictions are compared as (H, W) float32, clipped to 0 to 1, after
-histogram equalisation where it is asked for. Options vary each of these.
+of its end). With --between-frames, --rate, --at or --triggers images are looks at these times, the
+state advancing by windows of a size (instants.py). Frames and predictions are compared as (H, W)
+float32, clipped to 0 to 1, after histogram equalisation where it is asked for. Options vary each of
+these.
 
     OUTPUT/results/SEQUENCE/METHOD.json     what is written when one method has seen one sequence
     OUTPUT/results/SEQUENCE/METHOD.npz      some of its pictures
@@ -14,7 +16,9 @@ A file of results appears when it is whole, and a run that was interrupted goes 
 What cannot be measured is a named gap: null and a reason, never a NaN.
 """
 
+import copy
 import dataclasses
+import hashlib
 import importlib
 import importlib.metadata
 import json
@@ -25,11 +29,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import jax
 import numpy as np
 import tyro
 from tqdm import tqdm
 
 from firenet_jax.commands import options
+from firenet_jax.commands.times import Times, read_times, times_of
 from firenet_jax.errors import OutputError, RecordingError, SettingsError, logger
 from firenet_jax.evaluation import lpips, report
 from firenet_jax.evaluation.comparison import (
@@ -43,10 +49,11 @@ from firenet_jax.evaluation.comparison import (
     to_8_bit,
 )
 from firenet_jax.evaluation.equalise import Kind, equalise
-from firenet_jax.evaluation.methods import NAMES, Method, Missing, digest, load
+from firenet_jax.evaluation.methods import NAMES, Method, Missing, digest, load, look
 from firenet_jax.evaluation.results import METRICS, Measured, mean, summary
 from firenet_jax.events import Frames, Recording
 from firenet_jax.filters import check_span
+from firenet_jax.instants import Step, steps
 from firenet_jax.readers import FORMATS, open_recording
 from firenet_jax.settings import check_seed, parse_size
 from firenet_jax.storage.files import identity, named, read_arrays, write_arrays, write_text
@@ -54,7 +61,7 @@ from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import bar
 from firenet_jax.storage.runs import alone_in, check_same, differences, make_folder, read_record
 from firenet_jax.storage.video import write_video
-from firenet_jax.windows import Window, Windows, cut
+from firenet_jax.windows import Window, Windows, cut, in_words, usual
 
 # Seconds from the beginning of the Event Camera Dataset's sequences (EVREAL's; one of E2VID's
 # authors gave the same in rpg_e2vid's issue 17).
@@ -105,9 +112,12 @@ class Evaluate:
     e2vid_random: bool = False
     """Run E2VID with random weights, to measure its time."""
     events: Annotated[int | None, tyro.conf.arg(aliases=["-N"])] = None
-    """Windows of this many events instead of those between frames."""
+    """Windows of this many events instead of those between frames; with images at given times, of
+    what the state takes in."""
     duration: Annotated[float | None, tyro.conf.arg(aliases=["-T"])] = None
-    """Windows of this many milliseconds instead of those between frames."""
+    """Windows of this many milliseconds, likewise. With images at given times and neither: 0.35
+    events per pixel, at most 40 ms."""
+    times: Times = Times()
     keep_ratio: float = 1.0
     """Use only this share of the frames, drawn at random: windows between them get longer and
     uneven."""
@@ -141,7 +151,7 @@ class Evaluate:
         Windows(events=self.events, duration=self.duration)  # refuses numbers that cannot be
         if not 0 < self.keep_ratio <= 1:
             raise SettingsError(f"keep ratio is {self.keep_ratio}, but is a share, 0 to 1")
-        if self.keep_ratio < 1 and not self.between_frames:
+        if self.keep_ratio < 1 and not self.frame_to_frame:
             raise SettingsError(
                 "keep ratio thins out frames: it varies windows between frames only"
             )
@@ -161,12 +171,12 @@ class Evaluate:
         return [name.strip() for name in self.methods.split(",") if name.strip()]
 
     @property
-    def between_frames(self) -> bool:
-        return self.events is None and self.duration is None
+    def frame_to_frame(self) -> bool:
+        return self.events is None and self.duration is None and not self.times.wanted
 
     @property
     def windows(self) -> Windows:
-        return Windows(self.events, None, self.duration, self.between_frames)
+        return Windows(self.events, None, self.duration, self.frame_to_frame)
 
 
 def run(settings: Evaluate) -> dict:
@@ -321,7 +331,12 @@ def plan(name: str, recording: Recording, settings: Evaluate) -> Plan:
     warm = np.searchsorted(times, origin + round(1e6 * (start - settings.warm_up)), "right") - 1
     if warm >= 0:
         begin = max(begin, int(times[min(warm, first - 1)]))
-    return Plan(name, recording, numbers, times, first, last, origin, begin)
+    windows, wanted = settings.windows, times_of(settings.times, recording, recording.events())
+    if windows == Windows():
+        windows = usual(recording.events())
+    return Plan(
+        name, recording, numbers, times, first, last, origin, begin, windows=windows, wanted=wanted
+    )
 
 
 def interval(path: Path, settings: Evaluate) -> tuple[float, float]:
@@ -351,12 +366,45 @@ def first_event(recording: Recording, times: np.ndarray) -> int:
     return first
 
 
-def windows_of(plan: Plan, settings: Evaluate) -> Iterator[Window]:
+def steps_of(plan: Plan) -> Iterator[Window | Step]:
+    """Windows, which have an image each; or, of images at given times, the steps for those."""
     recording = plan.recording
-    frames = Frames(plan.times, plan.frames.read)
     later = (e.select(slice(np.searchsorted(e.t, plan.begin), None)) for e in recording.events())
-    recording = dataclasses.replace(recording, frames=frames)
-    return cut(recording, settings.windows, filter(len, later), plan.begin)
+    if plan.wanted is not None:  # a grid counts on
+        return steps(recording, plan.windows, copy.copy(plan.wanted), filter(len, later))
+    recording = dataclasses.replace(recording, frames=Frames(plan.times, plan.frames.read))
+    return cut(recording, plan.windows, filter(len, later), plan.begin)
+
+
+def predicted(
+    plan: Plan, method: Method, entries: Iterator[Window | Step]
+) -> Iterator[tuple[int, int, jax.Array]]:
+    """Yields (time, events, image) of each window, or of each step that looks."""
+    before = last = method.initial(plan.recording.height, plan.recording.width)
+    time = plan.begin
+    for entry in entries:
+        if isinstance(entry, Step) and entry.time is not None:
+            yield entry.time, len(entry.events), look(method, before, last, entry)
+            continue
+        if isinstance(entry, Window):
+            time = entry.time
+        elif len(entry.events):  # a step that is kept
+            time = int(entry.events.t[-1])
+        before = last
+        last, image = method.step(last, Window(entry.events, time))
+        if isinstance(entry, Window):
+            yield time, len(entry.events), image
+
+
+def until(latest: int, entries: Iterator[Window | Step]) -> Iterator[Window | Step]:
+    """Those that images up to this time need."""
+    for entry in entries:
+        time = entry.time
+        if time is None:  # kept, for images from its end on
+            time = int(entry.events.t[0]) if len(entry.events) else latest
+        if time > latest:
+            return
+        yield entry
 
 
 def displacement(plan: Plan, place: int) -> np.ndarray | None:
@@ -383,22 +431,18 @@ def evaluate(
     Raises Gap where no prediction counts or an image is not finite.
     """
     began, before = time.monotonic(), progress.n
-    windows = ahead(iter(windows_of(plan, settings)), depth=4)
+    entries = ahead(iter(steps_of(plan)), depth=4)
     tolerance = round(1000 * settings.tolerance)
     latest = int(plan.times[plan.last - 1]) + tolerance
     empty = 0
 
     def predictions():
         nonlocal empty
-        state = method.initial(plan.recording.height, plan.recording.width)
-        for window in windows:
-            if window.time > latest:
-                return
-            state, image = method.step(state, window)
-            empty += len(window.events) == 0
-            passed = np.searchsorted(plan.times, window.time, "right")
+        for time_of, events, image in predicted(plan, method, until(latest, entries)):
+            empty += events == 0
+            passed = np.searchsorted(plan.times, time_of, "right")
             progress.update(int(min(passed, plan.last)) - (progress.n - before))
-            yield window.time, image
+            yield time_of, image
 
     found, pictures = Measurements(plan, settings.equalise, learned), Pictures(plan)
     waiting: list[Comparison] = []
@@ -415,7 +459,7 @@ def evaluate(
         if waiting:
             pictures.add(waiting, found.add(waiting))
     finally:
-        windows.close()
+        entries.close()
         progress.update(plan.last - (progress.n - before))
     if not found.places:
         raise Gap(f"no prediction within {settings.tolerance:g} ms of a frame")
@@ -431,7 +475,21 @@ def describe(settings: Evaluate, learned: lpips.Lpips | None) -> dict:
              "equalise", "sensor_size")  # fmt: skip
     record = {name: getattr(settings, name) for name in names}
     record["lpips"] = None if learned is None else digest(learned)
+    if settings.times.wanted:
+        record["images_at"] = asked(settings.times)
     return record | {"version": importlib.metadata.version("firenet-jax")}
+
+
+def asked(times: Times) -> dict:
+    """What is not at its default; of a file of times what it holds, not its name."""
+    found = {
+        field.name: getattr(times, field.name)
+        for field in dataclasses.fields(times)
+        if getattr(times, field.name) != field.default
+    }
+    if times.at is not None:
+        found["at"] = hashlib.sha256(repr(read_times(times.at)).encode()).hexdigest()[:16]
+    return found
 
 
 def describe_one(shared: dict, recording: Recording, method: Method) -> dict:
@@ -502,6 +560,7 @@ def summarise(settings, shared, plans, recordings, methods, done, gaps) -> dict:
             "format": recording.format,
             "sensor": [recording.width, recording.height],
             "counted_seconds": [start, None if math.isinf(stop) else stop],
+            "images": None if name not in plans else images_in_words(plans[name], settings),
             "methods": entries,
         }
     names = [method.name for method in methods]
@@ -518,14 +577,29 @@ def summarise(settings, shared, plans, recordings, methods, done, gaps) -> dict:
     }
 
 
+def images_in_words(plan: Plan, settings: Evaluate) -> str:
+    """ "images at the times of its frames, the state by windows of 15,120 events" """
+    windows = in_words(plan.windows, plan.recording.pixels)
+    if not settings.times.wanted:
+        return windows
+    return f"{settings.times.in_words()}, the state by {windows}"
+
+
 def protocol(settings: Evaluate) -> list[str]:
     """What was done, in sentences, for people who read a table."""
-    if settings.between_frames:
+    if settings.frame_to_frame:
         windows = "windows between frames"
     elif settings.events is not None:
         windows = f"windows of {settings.events} events"
-    else:
+    elif settings.duration is not None:
         windows = f"windows of {settings.duration:g} ms"
+    else:
+        windows = "windows of 0.35 events per pixel, at most 40 ms or a twentieth of a recording"
+    if settings.times.wanted:
+        windows = (
+            f"{settings.times.in_words()}, each a look whose state is thrown away; the state by "
+            f"{windows} (hf and mr look at the events since)"
+        )
     if settings.keep_ratio < 1:
         windows += f", {settings.keep_ratio:g} of the frames kept (seed {settings.seed})"
     return [
@@ -604,11 +678,11 @@ def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
 
 
 def events_before(plan: Plan, settings: Evaluate, numbers: set[int]) -> dict[int, np.ndarray]:
-    """(H, W, 3) uint8 for each of these frames: the events of the window that ends there.
+    """(H, W, 3) uint8 for each of these frames: the events of the window or look that ends there.
 
     Drawn anew from the recording, and not kept with each method: it is as long as one of them."""
     recording, found, left = plan.recording, {}, set(numbers)
-    windows = ((window.time, window.events) for window in windows_of(plan, settings))
+    windows = ((e.time, e.events) for e in steps_of(plan) if e.time is not None)
     for place, events in matched(windows, plan.times, round(1000 * settings.tolerance)):
         if not left:
             break

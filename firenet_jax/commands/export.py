@@ -105,7 +105,8 @@ def simulated(height: int, width: int, seconds: float) -> Iterator[Events]:
 
 def write_file(path: Path, settings: Export) -> None:
     if path.suffix not in KINDS:
-        raise OutputError(f"{path}: cannot write {path.suffix or 'such'} files; try {KINDS}")
+        names = f"{', '.join(KINDS[:-1])} or {KINDS[-1]}"
+        raise OutputError(f"{path}: cannot write {path.suffix or 'such'} files; try {names}")
     runs = path.suffix in (".onnx", ".stablehlo")
     if not runs and (settings.picture or not settings.normalise):
         raise OutputError(

@@ -1,9 +1,9 @@
 """Events as they come -> pictures at once, on a page of this machine."""
 
-import itertools
 import json
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,7 +13,7 @@ import tyro
 
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.errors import RecordingError, SettingsError
-from firenet_jax.events import counted
+from firenet_jax.events import Events, counted
 from firenet_jax.live import sources
 from firenet_jax.live.engine import Figures, Limits, pictures
 from firenet_jax.live.page import Board, serve
@@ -132,11 +132,8 @@ def run(settings: Live) -> None:
     print(f"{source.name}, {size}: open {address} to watch, Ctrl-C ends", flush=True)
     count = Windows(events_per_pixel=settings.events_per_pixel).count(source.height * source.width)
     begun = time.monotonic()
-    if (seconds := settings.seconds) is not None:
-        arrivals = itertools.takewhile(
-            lambda _: time.monotonic() - begun < seconds, source.arrivals
-        )
-        source = source._replace(arrivals=arrivals)
+    if settings.seconds is not None:
+        source = source._replace(arrivals=_first(settings.seconds, source.arrivals))
     limits = Limits(count, round(1000 * settings.longest), settings.behind)
     shown = pictures(source, weights, limits, figures, settings.display)
     try:
@@ -160,9 +157,22 @@ def run(settings: Live) -> None:
     print(
         f"{counted(found['windows'], 'picture')} of {counted(found['events'], 'event')} in "
         f"{time.monotonic() - begun:.1f} s, {found['dropped_windows']:,} windows dropped, "
-        f"{found['bad_events']:,} events left out; latency {found['latency_ms']} ms, 95 % below "
-        f"{found['latency_95_ms']} ms"
+        f"{found['bad_events']:,} events left out"
+        + (
+            f"; latency {found['latency_ms']} ms, 95 % below {found['latency_95_ms']} ms"
+            if found["windows"]
+            else ""
+        )
     )
+
+
+def _first(seconds: float, arrivals: Iterator[Events]) -> Iterator[Events]:
+    """What comes in so long, from when it is asked for: what is compiled before does not count."""
+    begun = time.monotonic()
+    for events in arrivals:
+        if time.monotonic() - begun >= seconds:
+            return
+        yield events
 
 
 def _say(figures: Figures) -> None:

@@ -16,7 +16,6 @@ A file appears under its name when it is whole, so a run that was interrupted go
 
 import contextlib
 import importlib.metadata
-import io
 import itertools
 import json
 import math
@@ -56,6 +55,7 @@ from firenet_jax.simulation.sensor import (
     with_faults,
 )
 from firenet_jax.simulation.textures import load_textures
+from firenet_jax.storage.disk import Disk
 from firenet_jax.storage.files import check_readable, partial_name, write_text, writing
 from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import bar
@@ -184,7 +184,7 @@ def write_sequence(
     beside = partial_name(path)
     try:
         with writing(path), beside.open("w+b", buffering=0) as opened:
-            disk = _Disk(opened)
+            disk = Disk(opened)
             with h5py.File(disk, "w") as file:
                 times, flows = _write_pictures(file, disk.during(pictures), height, width)
                 count, facts = _write_events(file, disk.during(events), times)
@@ -206,79 +206,6 @@ def write_sequence(
         for stream in (events, pictures):
             getattr(stream, "close", bool)()  # of generators: ends their threads, closes files
     return count
-
-
-class _Disk:
-    """A file for h5py that takes every write, and tells afterwards of those that found no room.
-
-    HDF5 ends the whole process where the last writes of a file fail, which are those of closing
-    it. From the first write on that fails, all are kept in memory: what HDF5 still has in hand.
-    """
-
-    def __init__(self, file: io.FileIO):
-        self.file, self.at, self.error = file, 0, None
-        self.late: list[tuple[int, bytes]] = []  # (place, bytes) that are not on the disk
-
-    def check(self) -> None:
-        if self.error is not None:
-            raise self.error
-
-    def during(self, items: Iterable) -> Iterator:
-        """The same items, up to the first write that fails."""
-        for item in items:
-            self.check()
-            yield item
-
-    # What h5py asks of a file.
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        self.at = offset + (0, self.at, self.file.seek(0, 2))[whence]
-        return self.at
-
-    def tell(self) -> int:
-        return self.at
-
-    def write(self, data) -> int:
-        data = bytes(data)
-        try:
-            self.check()
-            self.file.seek(self.at)
-            rest = memoryview(data)
-            while rest:  # a disk that becomes full takes a part first
-                rest = rest[self.file.write(rest) :]
-        except OSError as error:
-            self.error = error
-            self.late.append((self.at, data))
-        self.at += len(data)
-        return len(data)
-
-    def read(self, size: int) -> bytes:
-        into = bytearray(size)
-        self.readinto(into)
-        return bytes(into)
-
-    def readinto(self, into) -> int:
-        into = memoryview(into).cast("B")
-        self.file.seek(self.at)
-        read = self.file.readinto(into)
-        into[read:] = bytes(len(into) - read)
-        for place, data in self.late:
-            first, last = max(place, self.at), min(place + len(data), self.at + len(into))
-            if first < last:
-                into[first - self.at : last - self.at] = data[first - place : last - place]
-        self.at += len(into)
-        return len(into)
-
-    def truncate(self, size: int) -> int:
-        try:
-            self.check()
-            self.file.truncate(size)
-        except OSError as error:
-            self.error = error
-        return size
-
-    def flush(self) -> None:
-        """Nothing waits: the file has no buffer."""
 
 
 def _write_pictures(file, pictures: Iterable[Picture], height, width) -> tuple[np.ndarray, int]:

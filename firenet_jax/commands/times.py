@@ -185,7 +185,8 @@ def read_times(path: Path) -> tuple[list[str], str | None, bool | None]:
             raise RecordingError(f"{path}: is larger than {LARGEST >> 20} MB: no list of times")
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: cannot read this file of times: {error}") from error
+        reason = getattr(error, "strerror", None) or "it is no text"
+        raise RecordingError(f"{path}: cannot read this file of times: {reason}") from error
     numbers, unit, since_start, column = [], None, None, 0
     for number, line in enumerate(lines, 1):
         line = line.strip()

@@ -15,6 +15,8 @@ from firenet_jax.evaluation import lpips, metrics
 from firenet_jax.evaluation.equalise import Kind, equalise
 from firenet_jax.evaluation.results import METRICS, Measured
 from firenet_jax.events import Frames, Recording
+from firenet_jax.instants import Grid
+from firenet_jax.windows import Windows
 
 BATCH = 8  # images that are compared at once
 STILLS = (0.2, 0.55, 0.9)  # places of the pictures that are kept, in the part that counts
@@ -38,6 +40,8 @@ class Plan(NamedTuple):
     last: int
     origin: int  # microseconds: the sequence's beginning
     begin: int  # microseconds: reconstruction begins here
+    windows: Windows  # as asked for, or as they suit the recording
+    wanted: np.ndarray | Grid | None = None  # times of images; None: one for each window
 
     @property
     def frames(self) -> Frames:

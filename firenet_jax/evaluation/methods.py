@@ -4,6 +4,7 @@
     state, image = method.step(state, window)        image: (H, W) float32 on the device
 
 Windows are consecutive, in time order, of any size; images are nominally 0 to 1 and not clipped.
+An image at a given time is a step whose state is thrown away (`look`).
 A method is a function below and a line in `load`. Networks compile once for a sensor size; what
 packs events compiles for each of a few sizes of windows (`tensors.CAPACITIES`).
 """
@@ -22,6 +23,7 @@ import numpy as np
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.errors import SettingsError, logger
 from firenet_jax.evaluation.baselines import e2vid, high_pass, manifold
+from firenet_jax.instants import Step
 from firenet_jax.network import Weights, initial_state
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.storage.files import named
@@ -38,6 +40,9 @@ class Method(NamedTuple):
     initial: Callable[[int, int], Any]  # height, width -> the state before the first window
     step: Callable[[Any, Window], tuple[Any, jax.Array]]  # (state, window) -> (state, image)
     record: dict  # all that its images depend on, ready for JSON
+    between: Callable[[float, Any, Any], Any] | None = None
+    """(share, state, next state) -> the state in between where a look begins; None: of a method
+    that has no diet, and looks at the events since the last state, from there."""
 
 
 class Missing(NamedTuple):
@@ -113,7 +118,7 @@ def firenet(name: str, weights: Weights) -> Method:
         return state, images[0, 0]
 
     record = {"method": "firenet", "normalise": weights.normalise, "weights": digest(weights)}
-    return Method(name, partial(initial_state, 1), step, record)
+    return Method(name, partial(initial_state, 1), step, record, _between)
 
 
 def recurrent_unet(name: str, params, settings: e2vid.Settings = e2vid.Settings()) -> Method:
@@ -134,7 +139,11 @@ def recurrent_unet(name: str, params, settings: e2vid.Settings = e2vid.Settings(
 
     as_published = {"normalise": settings.sigmoid, "stretched": settings.sigmoid}
     record = {"method": "e2vid", **as_published, **dataclasses.asdict(settings)}
-    return Method(name, initial, step, record | {"weights": digest(params)})
+
+    def between(share, before, last):
+        return last._replace(network=_between(share, before.network, last.network))
+
+    return Method(name, initial, step, record | {"weights": digest(params)}, between)
 
 
 @partial(jax.jit, static_argnames="settings")
@@ -159,6 +168,21 @@ def regularised(name: str, settings: manifold.Manifold = manifold.Manifold()) ->
     initial = partial(manifold.initial_state, settings=settings)
     record = {"method": "mr", **dataclasses.asdict(settings)}
     return Method(name, initial, partial(manifold.step, settings=settings), record)
+
+
+@jax.jit
+def _between(share, before, last):
+    return jax.tree.map(lambda a, b: (1 - share) * a + share * b, before, last)
+
+
+def look(method: Method, before: Any, last: Any, step: Step) -> jax.Array:
+    """The two states that were kept last, a step of `instants.steps` that looks -> its image."""
+    assert step.time is not None
+    if method.between is None:
+        events = step.events.select(slice(len(step.events) - step.new, None))
+        return method.step(last, Window(events, step.time))[1]
+    state = method.between(step.share, before, last)
+    return method.step(state, Window(step.events, step.time))[1]
 
 
 def digest(tree) -> str:

@@ -214,7 +214,8 @@ def page(results: dict, shown: dict[str, Shown]) -> str:
         width, height = facts["sensor"]
         parts += [
             f'<section><h2 id="{_anchor(number)}">{escape(name)}</h2>',
-            f"<p>{escape(facts['format'])}, {width}x{height}; counted: {_interval(facts)}</p>",
+            f"<p>{escape(facts['format'])}, {width}x{height}; counted: {_interval(facts)}; "
+            f"{escape(facts['images'] or 'no images')}</p>",
             f"<div class=wide>{_table(results, facts['methods'], colours, 'method')}</div>",
         ]
         if name in shown:
@@ -231,6 +232,7 @@ def about(method: str) -> str:
         "mr": "manifold regularisation (Reinbacher et al. 2016), not learned",
         "e2vid": "E2VID (Rebecq et al. 2019), from its checkpoint",
         "e2vid-random": "E2VID with random weights: its images mean nothing",
+        "firenet": "FireNet (Scheerlinck et al. 2020), the weights of this package",
         "built-in": "FireNet (Scheerlinck et al. 2020), the weights of this package",
     }
     return known.get(method, "FireNet (Scheerlinck et al. 2020) with the weights of this name")

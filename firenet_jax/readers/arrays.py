@@ -1,5 +1,7 @@
 """Arrays of one's own -> Recording: the same checks as a file's, and each says which array."""
 
+import math
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +45,7 @@ def recording(
     if not columns["t"].size:
         raise RecordingError(f"{name}: holds no events")
     for side, value in (("width", width), ("height", height)):
-        if int(value) != value or value < 1:
+        if not (isinstance(value, Real) and 1 <= value < math.inf and int(value) == value):
             raise RecordingError(f"{name}: {side} is {value}, but is a number of pixels")
     if unit not in (None, *UNITS):
         raise RecordingError(f"{name}: unit is {unit!r}, expected one of {', '.join(UNITS)}")

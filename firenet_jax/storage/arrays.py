@@ -14,6 +14,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from firenet_jax.storage.disk import Disk
 from firenet_jax.storage.files import lock_file, partial_name, writing
 
 
@@ -23,10 +24,12 @@ class ArraysWriter:
     def __init__(self, path: Path):
         self.path, self.partial, self.count = path, partial_name(path), 0
         with writing(path):
-            self.held = self.partial.open("ab")
+            self.partial.touch()
+            self.held = self.partial.open("r+b", buffering=0)  # not "w+b": it may be another run's
             lock_file(self.held, path)
-            # HDF5 would take the same lock once more, and find it taken.
-            self.file: Any = h5py.File(self.partial, "w", locking=False)
+            self.held.truncate(0)
+            self.disk = Disk(self.held)
+            self.file: Any = h5py.File(self.disk, "w")
 
     def _start(self, height: int, width: int) -> None:
         self.file.attrs["description"] = "images of events, by firenet_jax"
@@ -45,11 +48,13 @@ class ArraysWriter:
             for name, value in (("images", image), ("times", time), ("events", events)):
                 self.file[name].resize(self.count + 1, axis=0)
                 self.file[name][self.count] = value
+            self.disk.check()
         self.count += 1
 
     def finish(self) -> None:
         with writing(self.path):
             self.file.close()
+            self.disk.check()
             if os.name == "nt":  # an open file cannot be renamed there
                 self.held.close()
             self.partial.replace(self.path)

@@ -12,6 +12,7 @@ import importlib
 import os
 import re
 import shutil
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +58,8 @@ class BagWriter:
         """At the first picture: a database serves the thread that opened it and no other."""
         _remove(self.partial, self.path)  # of a run that was killed
         choice = {"version": 9} if self.ros2 else {}
-        bag = self.library.Writer(self.partial, **choice)
+        bag = self.bag = self.library.Writer(self.partial, **choice)
         bag.open()
-        self.bag = bag
         if os.name != "nt":  # no locks there, and folders cannot be opened
             handle = os.open(self.partial, os.O_RDONLY)
             self.holding.callback(os.close, handle)
@@ -91,13 +91,13 @@ class BagWriter:
             data=np.ascontiguousarray(picture).reshape(-1),
         )
         serialise = self.types.serialize_cdr if self.ros2 else self.types.serialize_ros1
-        with writing(self.path):
+        with _writing(self.path):
             bag = self.bag or self._start()
             bag.write(self.connection, 1000 * time, serialise(message, IMAGE))
         self.count += 1
 
     def finish(self) -> None:
-        with writing(self.path):
+        with _writing(self.path):
             self.bag.close()
             _remove(self.path, self.path)
             self.partial.rename(self.path)
@@ -117,6 +117,16 @@ class BagWriter:
             else:
                 self.partial.unlink()
         self.holding.close()
+
+
+@contextlib.contextmanager
+def _writing(path: Path):
+    """As `writing`, where a full disk may be the database's own kind of error."""
+    with writing(path):
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise OSError(str(error)) from error
 
 
 def _remove(place: Path, name: Path) -> None:

@@ -6,6 +6,7 @@ the error names it.
 
 import contextlib
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -65,9 +66,16 @@ def writing(path: Path):
     except OSError as error:
         where = "" if error.filename in (None, path, str(path)) else f", {error.filename}"
         raise OutputError(
-            f"{path}: cannot write ({error.strerror or error}{where}): nothing is under this "
+            f"{path}: cannot write ({_reason(error)}{where}): nothing is under this "
             "name yet; make room or choose another output"
         ) from error
+
+
+def _reason(error: OSError) -> str:
+    """HDF5 tells it in the midst of two lines, with the time and an address in memory."""
+    text = error.strerror or str(error)
+    told = re.search(r"error message = '([^']+)'", text)
+    return told[1] if told else " ".join(text.split())
 
 
 def lock(handle: int, path: Path) -> None:

@@ -346,6 +346,11 @@ def open_writer(
         check_rate(path, fps)
     if path.suffix in VIDEOS:
         return VideoWriter(path, fps, speed)
+    if path.suffix in WHOLE:
+        raise OutputError(
+            f"{path}: pictures go into a folder (for png), .mp4 or .gif; only reconstruct writes "
+            f"{path.suffix}"
+        )
     return FolderWriter(path, at_times, in_nanoseconds)
 
 
