@@ -21,16 +21,18 @@ from harness import save
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.commands.train import Cut, Score, cut_off, judged, run
 from firenet_jax.readers import open_recording
+from firenet_jax.training.batches import Augment
 from firenet_jax.training.losses import Loss
 from firenet_jax.training.settings import Train
 
 # A chain keeps what a network remembers over hundreds of windows, which short sequences undo.
 # SSIM sees structure and, as `l1` does, brightness, which keeps images between black and white.
 LOSS = Loss(l1=1.0, ssim=1.0, nlpd=0.0, haarpsi=0.0)
+# Where one event in a hundred pixels comes, hot pixels would be most of what a crop holds.
 CHOICES = {
     "weights": Path("built-in"), "learning_rate": 3e-4, "windows": 11, "chain": 4, "crop": 128,
     "batch": 2,
-    "near_events": True, "validate_every": 40, "loss": LOSS,
+    "near_events": True, "augment": Augment(hot_pixels=0.0), "validate_every": 40, "loss": LOSS,
 }  # fmt: skip
 
 
@@ -45,7 +47,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("recording", type=Path)
     parser.add_argument("--others", type=Path, nargs="*", default=[])
-    parser.add_argument("--steps", type=int, default=120)
+    parser.add_argument("--steps", type=int, default=80)
     parser.add_argument("--windows", type=int, default=CHOICES["windows"])
     parser.add_argument("--chain", type=int, default=CHOICES["chain"])
     parser.add_argument("--crop", type=int, default=CHOICES["crop"])

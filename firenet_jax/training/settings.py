@@ -100,8 +100,8 @@ class Train:
     process: int | None = None
     """Which one this is, from 0."""
     near_events: bool = False
-    """Count the loss only where, since a sequence began, events were nearby: nothing can be known
-    of the rest. For a camera that stands still."""
+    """Where no events were nearby since a sequence began, the truth is a frame's mean brightness:
+    more cannot be known there. For a camera that stands still."""
     loss: Loss = Loss()
     augment: Augment = Augment()
     """What happens to sequences from files."""

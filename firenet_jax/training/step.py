@@ -247,9 +247,9 @@ def loss_of(params, data: Simulation, state: State | None, warm, settings: StepS
     def one_device(params, data, state, warm):
         last, images = images_of(params, data.tensors, settings, state)
         truths = data.images
-        if settings.near_events:  # elsewhere an image is right, whatever it is
-            there = near_events(data.tensors)
-            truths = jnp.where(there, truths, jax.lax.stop_gradient(images))
+        if settings.near_events:  # a loss that is blind elsewhere lets the image run away there
+            level = truths.mean((-2, -1), keepdims=True)
+            truths = jnp.where(near_events(data.tensors), truths, level)
         truth = truths, data.displacement, data.visible
         losses = sequence_loss(images, *truth, settings.loss, warm)
         return jax.lax.pmean(losses, "devices"), (last, images)
