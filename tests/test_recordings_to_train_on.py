@@ -200,6 +200,18 @@ def test_the_end_is_judged_as_reconstruct_shows_it(folder, monkeypatch, warm):
     assert abs(score.ssim - np.mean(expected)) < 1e-5
 
 
+def test_an_end_without_events_is_judged_by_nothing(tmp_path):
+    pictures = [Picture(10_000 * k, np.full((24, 24), k, np.uint8), None) for k in range(8)]
+    path, events = tmp_path / "a.h5", Events.of([5, 79_000], [0, 0], [0, 0], [1, 1])
+    write_sequence(path, [events], pictures, height=24, width=24)
+    weights = Weights(initial_params(jax.random.key(1)), True)
+    one = train.cut_off(path, 3)
+    assert train.judged(weights, one, near=False).frames == 3
+    whole = train.judged(weights, one._replace(end=0), near=True)
+    assert whole.frames == 0 and np.isnan(whole.ssim)  # the corner: no window of SSIM is there
+    assert train.judged(weights, one._replace(end=7), near=False).frames == 0
+
+
 @pytest.mark.slow
 def test_training_on_a_recording_tells_before_and_after(tmp_path, folder, capsys):
     line = ["train", "-o", str(tmp_path / "run"), "--data", str(folder), str(folder / "../noise")]

@@ -21,7 +21,7 @@ import numpy as np
 
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.commands.simulate import Picture, write_sequence
-from firenet_jax.errors import RecordingError, SettingsError
+from firenet_jax.errors import RecordingError, SettingsError, logger
 from firenet_jax.evaluation import metrics
 from firenet_jax.evaluation.equalise import equalise
 from firenet_jax.events import Events, Frames, Recording
@@ -142,9 +142,14 @@ def _write(path: Path, one: Cut, first: int, last: int | None) -> None:
     pictures = (
         Picture(int(one.frames.times[n]) - zero, one.frames.read(n), flow(n)) for n in numbers
     )
-    size = {"height": one.recording.height, "width": one.recording.width}
-    settings = {"recording": str(one.recording.path), "zero": zero}
-    write_sequence(path, _between(one.recording, zero, until), pictures, **size, settings=settings)
+    write_sequence(
+        path,
+        _between(one.recording, zero, until),
+        pictures,
+        height=one.recording.height,
+        width=one.recording.width,
+        settings={"recording": str(one.recording.path), "zero": zero},
+    )
 
 
 def _between(recording: Recording, start: int, stop: int) -> Iterator[Events]:
@@ -175,6 +180,9 @@ def tell(cuts: list[Cut], settings: Train) -> None:
     where = " where events were" if settings.near_events else ""
     for one in cuts:
         new = judged(after, one, settings.near_events)
+        if not new.frames:
+            logger.warning("%s: no events before the frames held out", one.recording.path)
+            continue
         ssim, equalised = f"{new.ssim:.3f}", f"{new.equalised:.3f}"
         if before is not None:
             old = judged(before, one, settings.near_events)
@@ -212,5 +220,6 @@ def judged(weights: Weights, one: Cut, near: bool) -> Score:
             chosen = np.clip(images[np.array(counted), 0], 0, 1)
             pairs = (chosen, truths), (equalise(chosen, "global"), equalise(truths, "global"))
             scores.append(np.stack([metrics.ssim_where(*pair, there) for pair in pairs], -1))
-    scores = np.concatenate(scores)
-    return Score(len(scores), *map(float, np.nanmean(scores, 0)))
+    found = np.concatenate([np.zeros((0, 2)), *scores])
+    found = found[np.isfinite(found).all(1)]  # where no event was near, there is nothing to compare
+    return Score(len(found), *map(float, found.mean(0) if len(found) else (np.nan, np.nan)))
