@@ -3,6 +3,7 @@
 The commands are those of test_snippets.py."""
 
 import importlib
+import json
 import re
 from pathlib import Path
 
@@ -53,3 +54,12 @@ def test_messages_that_are_explained_are_those_of_the_program():
     assert len(messages) > 5
     for message in messages:
         assert message in source, message
+
+
+def test_what_is_said_of_fine_tuning_is_what_was_measured():
+    found = json.loads((ROOT / "experiments/results/fine_tune.json").read_text())
+    page = " ".join((DOCS / "train.md").read_text().split())
+    for scores in found["recordings"].values():
+        for name in ("ssim", "equalised"):
+            assert f"{scores['before'][name]:.3f} to {scores['after'][name]:.3f}" in page
+    assert f"{found['steps']} steps took {found['processor_seconds']:.0f} s" in page
