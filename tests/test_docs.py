@@ -1,15 +1,15 @@
-"""The site: its commands have the options they name, its code runs, its links lead somewhere."""
+"""The site: its links lead somewhere, its code knows the package, its pages are complete.
+
+The commands are those of test_snippets.py."""
 
 import importlib
+import json
 import re
-import shlex
 from pathlib import Path
 
 import pytest
-import tyro
 
 import firenet_jax as fj
-from firenet_jax import cli
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -18,27 +18,6 @@ PAGES = sorted(DOCS.glob("*.md"))
 
 def blocks(page, language):
     return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
-
-
-def commands(page):
-    """`firenet ...` lines: in blocks, and in code inside of a line."""
-    lines = [line for block in blocks(page, "bash") for line in block.splitlines()]
-    lines += re.findall(r"`(firenet [a-z]+ [^`]*)`", page.read_text())
-    return [line for line in lines if line.startswith("firenet ")]
-
-
-@pytest.mark.parametrize("page", [p for p in PAGES if commands(p)], ids=lambda page: page.stem)
-def test_commands_have_these_options(page):
-    for line in commands(page):
-        name, *rest = shlex.split(line)[1:]
-        if "--help" in rest or any(word.isupper() or word == "..." for word in rest):
-            continue
-        module, settings, _ = cli.COMMANDS[name]
-        kind = getattr(importlib.import_module(module), settings)
-        try:
-            tyro.cli(kind, args=rest, config=(tyro.conf.OmitArgPrefixes,))
-        except SystemExit:
-            pytest.fail(f"{page.name}: {line}")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -75,3 +54,12 @@ def test_messages_that_are_explained_are_those_of_the_program():
     assert len(messages) > 5
     for message in messages:
         assert message in source, message
+
+
+def test_what_is_said_of_fine_tuning_is_what_was_measured():
+    found = json.loads((ROOT / "experiments/results/fine_tune.json").read_text())
+    page = " ".join((DOCS / "train.md").read_text().split())
+    for scores in found["recordings"].values():
+        for name in ("ssim", "equalised"):
+            assert f"{scores['before'][name]:.3f} to {scores['after'][name]:.3f}" in page
+    assert f"{found['steps']} steps took {found['processor_seconds']:.0f} s" in page

@@ -12,13 +12,15 @@ from pathlib import Path
 import pytest
 from processes import COMPILES_SOON
 from test_pipeline import write_recording
+from test_snippets import write_with_frames
 
 import firenet_jax as fj
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 WEIGHTS = Path(fj.__file__).parent / "weights" / "firenet.npz"
 
-# Arguments that leave next to nothing to do. {recording} is a small one, {folder} where it lies.
+# Arguments that leave next to nothing to do. {recording} is a small one, {folder} where it lies,
+# {frames} one of a camera that takes pictures too.
 SMALL = {
     "bfloat16": f"{WEIGHTS} {{recording}} --windows 12",
     "calibration": "--seconds 0.3",
@@ -31,6 +33,7 @@ SMALL = {
     "figure5_recurrence": "--seconds 0.2",
     "figure6_limitations": "--seconds 0.2 --sequences 1",
     "file_to_pictures": "--events 60000 --runs 1",
+    "fine_tune": "{frames} --steps 1 --chain 1 --crop 24",
     "instants": "{recording}",
     "memory": "--hdf5 20000 --text 20000 --runs 1",
     "onnxruntime_step": "--sizes 48x32 --windows 2 --runs 1",
@@ -123,7 +126,10 @@ def test_runs(name, tmp_path):
     recording = tmp_path / "recordings" / "random.txt"
     recording.parent.mkdir()
     write_recording(recording, 20_000, width=64, height=48)
-    arguments = shlex.split(SMALL[name].format(recording=recording, folder=recording.parent))
+    frames = tmp_path / "frames.zip"
+    write_with_frames(frames)
+    named = {"recording": recording, "folder": recording.parent, "frames": frames}
+    arguments = shlex.split(SMALL[name].format(**named))
     done = subprocess.run(
         [sys.executable, f"experiments/{name}.py", *arguments],
         cwd=tmp_path,

@@ -442,7 +442,7 @@ def test_trains_on_files_and_resumes(tmp_path, chain):
         events = Events.of(t, *columns[0], columns[1])
         (tmp_path / "set").mkdir(exist_ok=True)
         write_sequence(tmp_path / "set" / f"{n}.h5", [events], pictures, height=32, width=32)
-    choices = {"data": tmp_path / "set", "chain": chain, "steps": 4}
+    choices = {"data": (tmp_path / "set",), "chain": chain, "steps": 4}
     settings = tiny(tmp_path / "whole", **choices)
     run(settings)
     assert [step for step, kind, _ in losses(tmp_path / "whole") if kind == "train"] == [1, 2, 3, 4]

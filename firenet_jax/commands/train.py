@@ -1,6 +1,225 @@
-"""Simulated sequences, or files of them -> weights: `firenet train`, which is `training.run`."""
+"""Simulated sequences, files of them, or recordings with frames -> weights: `firenet train`.
 
-from firenet_jax.training.run import run
+A recording with frames becomes two files of the layout that `training.batches` reads, in the
+folder of the run: its beginning to learn from, and its end, held out to judge by.
+
+    RUN/sequences/NAME.h5                up to the frame with which the end begins
+    RUN/sequences/validation/NAME.h5     from that frame on
+    RUN/sequences/settings.json          which recordings, and how many windows are held out
+
+Window t lasts from one frame to the next, as in `training.batches`, and frame t is the truth at its
+end. Afterwards the weights before and after are judged on the held-out ends, as `firenet
+reconstruct --frame-to-frame` shows them: whole images, of a state that is warm.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from firenet_jax.checkpoint import load_weights
+from firenet_jax.commands.simulate import Picture, write_sequence
+from firenet_jax.errors import RecordingError, SettingsError, logger
+from firenet_jax.evaluation import metrics
+from firenet_jax.evaluation.equalise import equalise
+from firenet_jax.events import Events, Frames, Recording
+from firenet_jax.network import Weights, initial_state
+from firenet_jax.readers import open_recording
+from firenet_jax.reconstruction import reconstruct
+from firenet_jax.storage import runs
+from firenet_jax.storage.files import identity, write_text
+from firenet_jax.tensors import capacity, in_groups, pack, voxelise
+from firenet_jax.training import run as training
 from firenet_jax.training.settings import Train
+from firenet_jax.training.step import near_events
+from firenet_jax.windows import Windows, cut
 
 __all__ = ["Train", "run"]
+
+SHARE = 5  # one in so many windows of a recording is held out, and no fewer than a step has
+WARM = 10_000_000  # microseconds before the held-out end at which judging begins
+TOGETHER = 8  # windows that are judged at once
+
+
+class Cut(NamedTuple):
+    """A recording whose last frames are held out."""
+
+    recording: Recording
+    frames: Frames
+    end: int  # the frame with which the held-out end begins; the first that is judged is the next
+
+
+def run(settings: Train) -> None:
+    """Trains as the settings say; on recordings, says how well it did on their ends.
+
+    Raises a FirenetError with a message of one sentence."""
+    if settings.on_recordings:
+        if settings.processes not in (None, 1):
+            raise SettingsError(
+                "recordings are trained on by one process: make sequences of them with one, then "
+                f"name {settings.sequences} as --data"
+            )
+        cuts = [cut_off(path, settings.windows) for path in settings.data]
+        write_sequences(cuts, settings)
+    training.run(settings)
+    if settings.on_recordings:
+        tell(cuts, settings)
+
+
+# ---- Recordings -> sequences
+
+
+def cut_off(path: Path, windows: int) -> Cut:
+    """A recording, of which the last fifth is held out, or as many windows as a step has.
+
+    Raises RecordingError where it has no frames, or too few of them for both parts.
+    """
+    recording = open_recording(path)
+    frames = recording.frames
+    if frames is None or len(frames.times) < 2:
+        raise RecordingError(
+            f"{path}: holds no frames to learn from: use a recording of a camera that takes "
+            "pictures beside the events, or a folder of HDF5 sequences"
+        )
+    _check_times(path, frames.times)
+    size = frames.read(0).shape
+    if size != (recording.height, recording.width):
+        raise RecordingError(
+            f"{path}: its frames have {size[1]}x{size[0]} pixels, its sensor "
+            f"{recording.width}x{recording.height}, expected the same"
+        )
+    count = len(frames.times) - 1
+    held = max(count // SHARE, windows)
+    if count - held < windows + 1:  # a start is drawn from one place or more
+        raise RecordingError(
+            f"{path}: has {count + 1} frames, but {2 * windows + 2} are needed to learn from "
+            f"{windows} windows in a row and to hold out as many: ask for fewer --windows"
+        )
+    return Cut(recording, frames, count - held)
+
+
+def _check_times(path: Path, times: np.ndarray) -> None:
+    if not (np.diff(times) > 0).all():
+        frame = int(np.argmin(np.diff(times) > 0)) + 1
+        raise RecordingError(
+            f"{path}, frame {frame + 1}: its time is {times[frame]} us, not after "
+            f"{times[frame - 1]} us, that of the frame before: the file is damaged"
+        )
+
+
+def write_sequences(cuts: list[Cut], settings: Train) -> None:
+    """The files of `settings.sequences`, those that are not there yet.
+
+    Raises OutputError where the folder holds others.
+    """
+    folder = settings.sequences
+    held = [len(one.frames.times) - 1 - one.end for one in cuts]
+    record = {"recordings": [identity(path) for path in settings.data], "held_out": held}
+    with runs.alone_in(folder):
+        way_out = "choose another --output"
+        found = runs.read_record(folder / "settings.json", way_out)
+        if found is not None:
+            runs.check_same(found, record, f"{folder} holds sequences of others", way_out)
+        write_text(folder / "settings.json", runs.as_text(record))
+        runs.make_folder(folder / "validation")
+        for number, one in enumerate(cuts):
+            # recordings of different folders may have one name
+            name = f"{number:03d}_{one.recording.path.stem}.h5"
+            parts = {folder / name: (0, one.end), folder / "validation" / name: (one.end, None)}
+            for path, (first, last) in parts.items():
+                if not path.exists():
+                    _write(path, one, first, last)
+
+
+def _write(path: Path, one: Cut, first: int, last: int | None) -> None:
+    """The frames first to last, the last one included, and the events between them; times count
+    from the first of them, for as seconds since 1970 they would not be whole microseconds."""
+    numbers = range(len(one.frames.times))[first : None if last is None else last + 1]
+    zero, until = (int(one.frames.times[number]) for number in (numbers[0], numbers[-1]))
+    flow = one.frames.flow or (lambda number: None)
+    pictures = (
+        Picture(int(one.frames.times[n]) - zero, one.frames.read(n), flow(n)) for n in numbers
+    )
+    write_sequence(
+        path,
+        _between(one.recording, zero, until),
+        pictures,
+        height=one.recording.height,
+        width=one.recording.width,
+        settings={"recording": str(one.recording.path), "zero": zero},
+    )
+
+
+def _between(recording: Recording, start: int, stop: int) -> Iterator[Events]:
+    """The events with start <= t < stop, as t - start."""
+    for events in recording.events():
+        if len(events) and events.t[0] >= stop:
+            return
+        part = events.select(slice(*np.searchsorted(events.t, (start, stop))))
+        if len(part):
+            yield Events(part.t - start, part.x, part.y, part.p)
+
+
+# ---- Judging
+
+
+class Score(NamedTuple):
+    """Means over the held-out frames."""
+
+    frames: int
+    ssim: float
+    equalised: float  # SSIM after a histogram equalisation: events tell no absolute brightness
+
+
+def tell(cuts: list[Cut], settings: Train) -> None:
+    """One line a recording: SSIM of its held-out end before and after."""
+    before = load_weights(settings.weights) if settings.weights is not None else None
+    after = load_weights(settings.output / "weights.npz")
+    where = " where events were" if settings.near_events else ""
+    for one in cuts:
+        new = judged(after, one, settings.near_events)
+        if not new.frames:
+            logger.warning("%s: no events before the frames held out", one.recording.path)
+            continue
+        ssim, equalised = f"{new.ssim:.3f}", f"{new.equalised:.3f}"
+        if before is not None:
+            old = judged(before, one, settings.near_events)
+            ssim = f"{old.ssim:.3f} before, {ssim} after"
+            equalised = f"{old.equalised:.3f}, {equalised}"
+        print(
+            f"{one.recording.path}: SSIM{where} of the {new.frames} frames held out {ssim} "
+            f"(equalised: {equalised})"
+        )
+
+
+def judged(weights: Weights, one: Cut, near: bool) -> Score:
+    """How close the images of the held-out end come to the frames at their time.
+
+    near: only where events were since judging began, at most WARM before the end.
+    """
+    times = one.frames.times
+    first = int(np.searchsorted(times, times[one.end] - WARM))
+    windows = cut(one.recording, Windows(between_frames=True), begin=int(times[first]))
+    numbered = zip(range(first + 1, len(times)), windows, strict=False)
+    state = initial_state(1, one.recording.height, one.recording.width)
+    seen, scores, size = jnp.zeros((1, *state.g1.shape[:3]), bool), [], 0
+    for group in in_groups(numbered, TOGETHER):
+        rows = [[window.events] for _, window in group]
+        rows += [[Events.empty()]] * (TOGETHER - len(group))
+        size = capacity(sum(len(row[0]) for row in rows), size)
+        tensors = voxelise(pack(rows, size), height=state.g1.shape[1], width=state.g1.shape[2])
+        state, images = reconstruct(weights, state, tensors)
+        near_now = near_events(tensors) | seen
+        seen = near_now[-1:]
+        counted = [k for k, (number, _) in enumerate(group) if number > one.end]
+        if counted:
+            truths = np.stack([one.frames.read(group[k][0]) for k in counted]) / np.float32(255)
+            there = near_now[np.array(counted), 0] if near else np.ones(truths.shape, bool)
+            chosen = np.clip(images[np.array(counted), 0], 0, 1)
+            pairs = (chosen, truths), (equalise(chosen, "global"), equalise(truths, "global"))
+            scores.append(np.stack([metrics.ssim_where(*pair, there) for pair in pairs], -1))
+    found = np.concatenate([np.zeros((0, 2)), *scores])
+    found = found[np.isfinite(found).all(1)]  # where no event was near, there is nothing to compare
+    return Score(len(found), *map(float, found.mean(0) if len(found) else (np.nan, np.nan)))

@@ -174,6 +174,16 @@ def ssim(
     return _mean(luminance * cs)
 
 
+@jax.jit
+def ssim_where(image: jax.Array, truth: jax.Array, there: jax.Array) -> jax.Array:
+    """The mean of `ssim` over the windows in whose middle is a pixel that is `there`, (..., H, W)
+    bool; NaN where none is."""
+    luminance, cs = _ssim_factors(*_compared(image, truth), 1.5, 1.0)
+    margin = WINDOW // 2
+    there = there[..., margin:-margin, margin:-margin]
+    return (luminance * cs * there).sum((-2, -1)) / there.sum((-2, -1))
+
+
 SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 WINDOW = 11  # pixels of the window of SSIM at sigma 1.5
 

@@ -89,6 +89,11 @@ def find(folder: Path) -> list[Path]:
     return files
 
 
+def is_set(path: Path) -> bool:
+    """Whether this is a folder of sequences, and no recording."""
+    return path.is_dir() and any(file.suffix.lower() in SUFFIXES for file in path.rglob("*"))
+
+
 def split(folder: Path) -> tuple[list[Path], list[Path]]:
     """A folder -> files for training, files for validation; both sorted, neither empty.
 

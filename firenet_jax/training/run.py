@@ -170,7 +170,7 @@ def first_state(settings: Train) -> TrainState:
                 "them: start from other weights, or from none"
             )
         params = weights.params
-    return initial_train_state(params, settings.step_settings, settings.data is None)
+    return initial_train_state(params, settings.step_settings, not settings.data)
 
 
 def _keys(settings: Train) -> list[jax.Array]:
@@ -190,8 +190,8 @@ def sources_of(settings: Train, done: int) -> tuple[Iterator, list[Callable[[], 
     cut anew, but from the same pictures: they choose between the steps of a run; how good a
     network is on pictures it never saw they do not tell.
     """
-    if settings.data is not None:
-        files, others = split(settings.data)
+    if settings.data:
+        files, others = split(settings.sequences)
         shape = {"batch": settings.batch, "windows": settings.windows, "crop": settings.crop}
         chain, augment = settings.chain, settings.augment
         training = batches(
@@ -235,7 +235,9 @@ def _check_finite(terms: dict[str, float], state: TrainState, folder: Path) -> N
 
 def _record(settings: Train) -> dict:
     """All that the weights depend on, and how often a run is looked at."""
-    return runs.recorded(settings, but=("output", "coordinator", "processes", "process"))
+    data = settings.data[0] if len(settings.data) == 1 else list(settings.data) or None
+    but = "output", "coordinator", "processes", "process"
+    return runs.recorded(settings, but=but, data=data)
 
 
 def _check_settings(folder: Path, settings: Train) -> None:

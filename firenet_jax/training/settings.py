@@ -17,7 +17,7 @@ from firenet_jax.errors import SettingsError
 from firenet_jax.settings import check_range, check_seed
 from firenet_jax.simulation.scenes import SceneSettings
 from firenet_jax.simulation.sensor import FAULTY, SensorSettings, check_rare
-from firenet_jax.training.batches import Augment
+from firenet_jax.training.batches import Augment, is_set
 from firenet_jax.training.losses import DISTANCES, Loss
 from firenet_jax.training.step import StepSettings
 
@@ -33,15 +33,16 @@ class Train:
       firenet train -o run --images coco/train2017 --steps 100000
       firenet simulate -o set --sequences 1000  and then  firenet train -o run --data set
       firenet train -o tuned --weights built-in --learning-rate 1e-4
+      firenet train -o tuned --weights built-in --learning-rate 1e-4 --data davis.aedat4
     """
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder of the run; an interrupted run in it goes on."""
     weights: Annotated[Path | None, tyro.conf.arg(aliases=["-c"])] = None
     """Start from these weights instead of random ones; built-in: those of the package."""
-    data: Path | None = None
-    """Folder of HDF5 sequences to train on (`firenet simulate`, or downloaded) instead of
-    simulating as it goes; settings of textures, renderings, scenes and sensors play no part."""
+    data: tuple[Path, ...] = ()
+    """A folder of HDF5 sequences (`firenet simulate`, or downloaded), or recordings with frames,
+    whose ends are held out: instead of simulating as it goes."""
     images: Path | None = None
     """Folder of pictures for textures (default: scikit-image's photographs, and drawn ones)."""
     textures: int = 256
@@ -98,6 +99,9 @@ class Train:
     """How many processes."""
     process: int | None = None
     """Which one this is, from 0."""
+    near_events: bool = False
+    """Where no events were nearby since a sequence began, the truth is a frame's mean brightness:
+    more cannot be known there. For a camera that stands still."""
     loss: Loss = Loss()
     augment: Augment = Augment()
     """What happens to sequences from files."""
@@ -145,6 +149,16 @@ class Train:
                 f"warmup is {self.warmup} steps of {self.steps}: use 0 or more, fewer"
             )
         check_processes(self.coordinator, self.processes, self.process)
+
+    @property
+    def on_recordings(self) -> bool:
+        """Whether `data` are recordings with frames."""
+        return bool(self.data) and not (len(self.data) == 1 and is_set(self.data[0]))
+
+    @property
+    def sequences(self) -> Path:
+        """Where the HDF5 sequences are, or those made of recordings: `data` is not empty."""
+        return self.output / "sequences" if self.on_recordings else self.data[0]
 
     @property
     def step_settings(self) -> StepSettings:

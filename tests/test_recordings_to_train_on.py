@@ -1,0 +1,230 @@
+"""Recordings with frames: what is learnt from them, what is held out, how the end is judged."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_train import entries, tiny
+
+import firenet_jax as fj
+from firenet_jax import cli
+from firenet_jax.commands import train
+from firenet_jax.commands.simulate import Picture, write_sequence
+from firenet_jax.errors import OutputError, RecordingError, SettingsError
+from firenet_jax.evaluation import metrics
+from firenet_jax.events import Events, concatenate
+from firenet_jax.network import Weights, initial_params
+from firenet_jax.readers import open_recording
+from firenet_jax.simulation.sensor import Simulation
+from firenet_jax.training.settings import Train
+from firenet_jax.training.step import loss_of, near_events
+
+SIZE, FRAMES, EVERY = 40, 20, 10_000
+ZERO = 1_600_000_000_000_000  # microseconds since 1970, as DAVIS cameras count
+
+
+def write_folder(path, frames=FRAMES, seed=0):
+    """An ECD folder of noise: events before the first frame and after the last one too."""
+    from PIL import Image
+
+    rng = np.random.default_rng(seed)
+    (path / "images").mkdir(parents=True)
+    times = ZERO + 5_000 + EVERY * np.arange(frames)
+    lines = []
+    for number, time in enumerate(times):
+        name = f"images/frame_{number:08d}.png"
+        Image.fromarray(rng.integers(0, 256, (SIZE, SIZE), np.uint8)).save(path / name)
+        lines.append(f"{time // 10**6}.{time % 10**6:06d} {name}\n")
+    (path / "images.txt").write_text("".join(lines))
+    t = np.sort(ZERO + rng.integers(0, frames * EVERY, 4000))
+    t[100:103] = times[3]  # at the time of a frame: of the window that begins there
+    t.sort()
+    x, y, p = rng.integers(0, (SIZE, SIZE, 2), (4000, 3)).T
+    x[0], y[0] = SIZE - 1, SIZE - 1
+    (path / "events.txt").write_text(
+        "".join(
+            f"{t // 10**6}.{t % 10**6:06d} {x} {y} {p}\n"
+            for t, x, y, p in zip(t, x, y, p, strict=True)
+        )
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_folder(tmp_path_factory.mktemp("recordings") / "noise")
+
+
+def all_events(path):
+    return concatenate(list(open_recording(path).events()))
+
+
+def test_the_parts_hold_what_the_recording_holds_between_its_frames(tmp_path, folder):
+    settings = tiny(tmp_path / "run", data=(folder,))
+    train.write_sequences([train.cut_off(folder, settings.windows)], settings)
+    parts = settings.sequences / "000_noise.h5", settings.sequences / "validation/000_noise.h5"
+    whole = open_recording(folder)
+    events, times = all_events(folder), whole.frames.times
+    # 19 windows: 3 are held out, a fifth, which is as many as a step has
+    for path, first, last in zip(parts, (0, 16), (16, 19), strict=True):
+        part, found = open_recording(path), all_events(path)
+        inside = events.select((times[first] <= events.t) & (events.t < times[last]))
+        assert part.frames.times.tolist() == (times[first : last + 1] - times[first]).tolist()
+        for name in "xyp":
+            np.testing.assert_array_equal(getattr(found, name), getattr(inside, name))
+        np.testing.assert_array_equal(found.t, inside.t - times[first])
+        for n in range(last - first + 1):
+            np.testing.assert_array_equal(part.frames.read(n), whole.frames.read(first + n))
+
+
+@pytest.mark.parametrize("frames, windows, end", [(50, 3, 40), (50, 21, 28), (8, 3, 4)])
+def test_a_fifth_is_held_out_and_no_fewer_windows_than_a_step_has(tmp_path, frames, windows, end):
+    assert train.cut_off(write_folder(tmp_path / "a", frames), windows).end == end
+
+
+def test_recordings_that_cannot_be_learnt_from_are_said(tmp_path, folder):
+    (tmp_path / "events.txt").write_text("40 40\n0.1 3 3 1\n0.2 3 3 0\n")
+    with pytest.raises(RecordingError, match="holds no frames to learn from"):
+        train.cut_off(tmp_path / "events.txt", 3)
+    with pytest.raises(RecordingError, match="has 20 frames, but 22 are needed.*fewer --windows"):
+        train.cut_off(folder, 10)
+    assert train.cut_off(folder, 9).end == 10
+    backwards = tmp_path / "backwards.h5"
+    pictures = [Picture(t, np.zeros((8, 8), np.uint8), None) for t in (0, 20_000, 10_000)]
+    write_sequence(backwards, [Events.of([5], [1], [1], [1])], pictures, height=8, width=8)
+    with pytest.raises(RecordingError, match="frame 3: its time is 10000 us, not after 20000 us"):
+        train.cut_off(backwards, 1)
+    with pytest.raises(SettingsError, match="by one process"):
+        train.run(tiny(tmp_path / "run", data=(folder,), processes=2, process=0,
+                       coordinator="127.0.0.1:1"))  # fmt: skip
+
+
+def test_a_run_keeps_to_its_recordings(tmp_path, folder):
+    other = write_folder(tmp_path / "other", seed=1)
+    settings = tiny(tmp_path / "run", data=(folder,))
+    train.write_sequences([train.cut_off(folder, 3)], settings)
+    written = {path: path.stat().st_mtime_ns for path in settings.sequences.rglob("*.h5")}
+    train.write_sequences([train.cut_off(folder, 3)], settings)
+    assert {p: p.stat().st_mtime_ns for p in settings.sequences.rglob("*.h5")} == written
+    for data, windows in (((other,), 3), ((folder,), 5)):
+        changed = dataclasses.replace(settings, data=data)
+        with pytest.raises(OutputError, match="holds sequences of others"):
+            train.write_sequences([train.cut_off(path, windows) for path in data], changed)
+
+
+def test_a_folder_of_sequences_is_no_recording(tmp_path, folder):
+    (tmp_path / "set/validation").mkdir(parents=True)
+    (tmp_path / "set/validation/a.h5").touch()
+    sets = Train(tmp_path / "run", data=(tmp_path / "set",))
+    assert not sets.on_recordings and sets.sequences == tmp_path / "set"
+    one = Train(tmp_path / "run", data=(folder,))
+    assert one.on_recordings and one.sequences == tmp_path / "run/sequences"
+    assert not Train(tmp_path / "run").on_recordings
+
+
+def test_near_events_are_those_within_four_pixels_in_this_window_or_before():
+    rng = np.random.default_rng(0)
+    tensors = np.where(rng.random((4, 2, 24, 30, 5)) < 2e-4, -0.5, 0).astype(np.float32)
+    expected = np.zeros(tensors.shape[:-1], bool)
+    for t, b, y, x in np.argwhere((tensors != 0).any(-1)):
+        expected[t:, b, max(0, y - 4) : y + 5, max(0, x - 4) : x + 5] = True
+    assert 0 < expected.mean() < 0.9
+    np.testing.assert_array_equal(near_events(jnp.asarray(tensors)), expected)
+
+
+def test_what_no_event_tells_of_teaches_brightness_alone(tmp_path):
+    """Other details of frames where nothing happens: the same gradients; where events are: others.
+    And the image is held where nothing happens: a brighter frame has another gradient."""
+    settings = tiny(tmp_path, near_events=True).step_settings
+    rng = np.random.default_rng(0)
+    tensors = np.zeros((3, 1, 32, 32, 5), np.float32)
+    tensors[:, :, :8, :8] = rng.normal(size=(3, 1, 8, 8, 5))
+    images = rng.random((3, 1, 32, 32)).astype(np.float32)
+    params = initial_params(jax.random.key(0))
+
+    def gradient(images):
+        still = jnp.zeros((3, 1, 32, 32, 2)), jnp.zeros((3, 1, 32, 32), bool)
+        data = Simulation(jnp.asarray(tensors), jnp.asarray(images), *still)
+        grad = jax.grad(lambda p: loss_of(p, data, None, False, settings)[0])(params)
+        return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(grad)])
+
+    far, close = images.copy(), images.copy()
+    far[..., 12:, :] = far[..., 12:, ::-1]
+    close[..., :8, :8] = 1 - close[..., :8, :8]
+    first = gradient(images)
+    np.testing.assert_allclose(gradient(far), first, atol=1e-5)
+    brighter = np.where(np.arange(32)[:, None] < 12, images, images + 0.2)
+    assert np.abs(gradient(brighter) - first).max() > 1e-4
+    assert np.abs(gradient(close) - first).max() > 1e-4
+
+
+def test_ssim_where_is_the_mean_of_the_map_there():
+    from skimage.metrics import structural_similarity
+
+    rng = np.random.default_rng(0)
+    a, b = rng.random((2, 30, 40)).astype(np.float32)
+    there = rng.random((30, 40)) < 0.3
+    options = {"gaussian_weights": True, "use_sample_covariance": False, "data_range": 1.0}
+    _, whole = structural_similarity(a, b, full=True, **options)
+    inner = np.s_[5:-5, 5:-5]
+    expected = whole[inner][there[inner]].mean()
+    assert abs(float(metrics.ssim_where(a, b, there)) - expected) < 1e-5
+    everywhere = metrics.ssim_where(a, b, np.ones((30, 40), bool))
+    assert abs(float(everywhere) - float(metrics.ssim(a, b))) < 1e-6
+    assert np.isnan(metrics.ssim_where(a, b, np.zeros((30, 40), bool)))
+
+
+@pytest.mark.parametrize("warm", [10_000_000, 55_000])
+def test_the_end_is_judged_as_reconstruct_shows_it(folder, monkeypatch, warm):
+    """Against the public functions, from the first window or from a later one on."""
+    monkeypatch.setattr(train, "WARM", warm)
+    weights = Weights(initial_params(jax.random.key(1)), True)
+    one = train.cut_off(folder, 5)  # frames 15 to 19 are judged
+    begin = max(0, one.end - -(-warm // EVERY) + (warm % EVERY > 0))
+    recording, times = one.recording, one.frames.times
+    events = all_events(folder)
+    state = fj.initial_state(1, SIZE, SIZE)
+    expected = []
+    for n in range(begin + 1, FRAMES):
+        inside = events.select((times[n - 1] <= events.t) & (events.t < times[n]))
+        tensor = fj.voxelise(fj.pack([[inside]]), height=SIZE, width=SIZE)
+        state, image = fj.reconstruct(weights, state, tensor)
+        if n > one.end:
+            truth = recording.frames.read(n) / np.float32(255)
+            expected.append(float(metrics.ssim(np.clip(image[0, 0], 0, 1), truth)))
+    score = train.judged(weights, one, near=False)
+    assert score.frames == len(expected) == 5
+    assert abs(score.ssim - np.mean(expected)) < 1e-5
+
+
+def test_an_end_without_events_is_judged_by_nothing(tmp_path):
+    pictures = [Picture(10_000 * k, np.full((24, 24), k, np.uint8), None) for k in range(8)]
+    path, events = tmp_path / "a.h5", Events.of([5, 79_000], [0, 0], [0, 0], [1, 1])
+    write_sequence(path, [events], pictures, height=24, width=24)
+    weights = Weights(initial_params(jax.random.key(1)), True)
+    one = train.cut_off(path, 3)
+    assert train.judged(weights, one, near=False).frames == 3
+    whole = train.judged(weights, one._replace(end=0), near=True)
+    assert whole.frames == 0 and np.isnan(whole.ssim)  # the corner: no window of SSIM is there
+    assert train.judged(weights, one._replace(end=7), near=False).frames == 0
+
+
+@pytest.mark.slow
+def test_training_on_a_recording_tells_before_and_after(tmp_path, folder, capsys):
+    line = ["train", "-o", str(tmp_path / "run"), "--data", str(folder), str(folder / "../noise")]
+    line += ["--weights", "built-in", "--steps", "4", "--crop", "32", "--windows", "3"]
+    line += ["--l0", "1", "--near-events", "--log-every", "1", "--validate-every", "2"]
+    assert cli.main(line) == 0
+    said = capsys.readouterr().out.splitlines()[-2:]
+    for sentence in said:
+        assert "SSIM where events were of the 3 frames held out" in sentence
+        assert " before, " in sentence and " after" in sentence
+    kinds = [entry["kind"] for entry in entries(tmp_path / "run")]
+    assert kinds.count("train") == 4 and kinds.count("validation") == 2
+    record = json.loads((tmp_path / "run/settings.json").read_text())
+    assert len(record["data"]) == 2
+    assert cli.main(line) == 0  # it is done: judged again
+    assert capsys.readouterr().out.splitlines()[-2:] == said
