@@ -27,7 +27,7 @@ HEIGHT, WIDTH = 24, 32
 # What is added to a command so that it takes seconds; the last of two options counts.
 SMALLER = {
     "demo": "--seconds 0.3 --sensor-size 32x24",
-    "simulate": "--sequences 2 --seconds 0.3 --sensor-size 32x24",
+    "simulate": "--sequences 3 --validation 1 --seconds 0.3 --sensor-size 32x24",
     "train": "--steps 1 --batch 1 --crop 24 --windows 3 --l0 1 --textures 4 --haarpsi 0 --nlpd 0",
     "evaluate": "--warm-up 0.2",
     "reconstruct a.zip -o part.mp4": "--start 0.1 --stop 0.3",
@@ -144,7 +144,7 @@ def stand_ins(tmp_path_factory):
     for name in ("photographs", "coco/train2017"):
         (folder / name).mkdir(parents=True)
         for n in range(2):
-            picture = Image.fromarray(rng.integers(0, 256, (64, 64), np.uint8))
+            picture = Image.fromarray(rng.integers(0, 256, (300, 300), np.uint8))
             picture.save(folder / name / f"{n}.png")
     write_video(folder / "clip.mp4", rng.integers(0, 256, (5, HEIGHT, WIDTH), np.uint8), fps=30)
     (folder / "times.txt").write_text("0.1\n0.2\n0.3\n")
