@@ -8,8 +8,8 @@ For changes that should change nothing. Each checkout runs the commands below in
 own, on a small recording and a set that it simulates, and on what is in FOLDER. What it writes,
 what it prints and how it ends is compared; in texts, how long something took is left out, and of
 TensorBoard's, Orbax's and StableHLO's files, which hold dates or lines of source, that they are
-there. `firenet live` is left out:
-what it gives depends on the clock. Ends with 1 where something differs.
+there. `firenet live` is left out: what it gives depends on the clock. Ends with 1 where something
+differs.
 """
 
 import argparse
