@@ -122,19 +122,19 @@ def chosen(seed: int, count: int) -> list[Change]:
     return taken[:count]
 
 
-def tested(folder: Path, module: str, limit: float) -> tuple[bool, float]:
-    """(whether the module's tests pass in this copy, seconds)"""
+def tested(folder: Path, module: str, limit: float) -> tuple[bool, float, str]:
+    """(whether the module's tests pass in this copy, seconds, what they print)"""
     tests = [f"tests/test_{name}.py" for name in MODULES[module]]
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
     begun = time.monotonic()
     try:
         done = subprocess.run(
-            command, cwd=folder, env=environment, capture_output=True, timeout=limit
+            command, cwd=folder, env=environment, capture_output=True, text=True, timeout=limit
         )
     except subprocess.TimeoutExpired:
-        return False, limit
-    return done.returncode == 0, time.monotonic() - begun
+        return False, limit, ""
+    return done.returncode == 0, time.monotonic() - begun, done.stdout + done.stderr
 
 
 def main() -> int:
@@ -158,9 +158,9 @@ def main() -> int:
             path = folder / "firenet_jax" / change.module
             source = path.read_text(encoding="utf-8")
             if change.module not in limits:  # they must pass as they are, or nothing is shown
-                passed, seconds = tested(folder, change.module, 10 * LIMIT)
+                passed, seconds, said = tested(folder, change.module, 10 * LIMIT)
                 if not passed:
-                    print(f"{change.module}: its tests fail without a change")
+                    print(f"{said}\n{change.module}: its tests fail without a change")
                     return 2
                 limits[change.module] = max(LIMIT, 3 * seconds)
             before = source.splitlines()[change.line - 1].strip()
@@ -170,7 +170,7 @@ def main() -> int:
                 equivalent += 1
                 continue
             path.write_text(change.of(source), encoding="utf-8")
-            passed, seconds = tested(folder, change.module, limits[change.module])
+            passed, seconds, _ = tested(folder, change.module, limits[change.module])
             path.write_text(source, encoding="utf-8")
             found += not passed
             if passed:

@@ -7,8 +7,9 @@
 For changes that should change nothing. Each checkout runs the commands below in a process of its
 own, on a small recording and a set that it simulates, and on what is in FOLDER. What it writes,
 what it prints and how it ends is compared; in texts, how long something took is left out, and of
-TensorBoard's and Orbax's files, which hold dates, that they are there. `firenet live` is left out:
-what it gives depends on the clock. Ends with 1 where something differs.
+TensorBoard's, Orbax's and StableHLO's files, which hold dates or lines of source, that they are
+there. `firenet live` is left out: what it gives depends on the clock. Ends with 1 where something
+differs.
 """
 
 import argparse
@@ -28,12 +29,12 @@ import numpy as np
 SMALL = "--sensor-size 48x36"
 COMMANDS = f"""
 simulate -o set --sequences 2 --seconds 0.4 {SMALL} --seed 3 --faults
-simulate -o one.h5 --sequences 1 --seconds 0.4 {SMALL}
 info sample.txt
 info set/train/000001.h5 --json
 convert built-in -o converted.npz
 reconstruct sample.txt -o folder -N 200
 reconstruct sample.txt -o folder.mp4
+simulate --video folder.mp4 -o clip.h5
 reconstruct sample.txt -o slow.gif --speed 0.5 --preview -T 40
 reconstruct sample.txt -o images.h5 -N 300
 reconstruct sample.txt -o cam.bag --rate 20
@@ -49,8 +50,8 @@ reconstruct broken.txt -o broken
 reconstruct nothing.txt -o nothing
 demo -o demo.mp4 --seconds 0.5 {SMALL} --faults
 evaluate set/train -o report --methods firenet,hf,mr --warm-up 1
-train -o run --data set --steps 2 --crop 32 --windows 4 --batch 2
-train -o drawn --steps 2 --crop 32 --windows 3 --batch 2 --textures 4
+train -o run --data set --steps 2 --crop 32 --windows 12 --batch 2
+train -o drawn --steps 2 --crop 32 --windows 12 --batch 2 --textures 4
 export -o firenet.onnx --picture
 export -o firenet.stablehlo
 export -o firenet.pth
@@ -61,7 +62,9 @@ info {path} --json
 reconstruct {path} -o {name}.mp4 --stop 0.15
 reconstruct {path} -o {name} --stop 0.1 --hot-pixels auto
 """
-DATED = re.compile(r"events\.out\.tfevents|/checkpoints?/|\.orbax|_METADATA|manifest\.ocdbt|/d/")
+DATED = re.compile(
+    r"\.stablehlo|events\.out\.tfevents|/checkpoints?/|\.orbax|_METADATA|manifest\.ocdbt|/d/"
+)
 TEXTS = (".json", ".jsonl", ".txt", ".csv", ".html")
 # 59 pictures of 78,830 events in 15.0 s (3.9 pictures/s, 5.2 kev/s); "seconds": 1.25
 TOOK = re.compile(
@@ -90,7 +93,6 @@ def run_all(lines: list[str]) -> None:
     for number, line in enumerate(lines):
         for path in Path().rglob("*"):  # a recording is known by when it was changed, too
             os.utime(path, (1e9, 1e9))
-        print(f"  {line}", file=sys.stderr, flush=True)
         said = io.StringIO()
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             try:
@@ -98,6 +100,7 @@ def run_all(lines: list[str]) -> None:
             except SystemExit as end:
                 code = end.code
         kept = "\n".join(part for part in re.split("[\r\n]", said.getvalue()) if "%" not in part)
+        print(f"  {code}  {line}", file=sys.stderr, flush=True)
         Path(f"said_{number:02d}.txt").write_text(f"{line}\n{code}\n{kept}")
 
 
