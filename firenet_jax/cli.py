@@ -140,10 +140,11 @@ def sentence(error: Exception, command: str) -> str | None:
     """What a person is told who can put it right; None where the fault is this package's."""
     if isinstance(error, ModuleNotFoundError):
         library = (error.name or "").partition(".")[0]
-        if library in EXTRAS:
+        if library in EXTRAS:  # several extras bring some: a command's own has its name
+            extra = command if command in EXTRAS.values() else EXTRAS[library]
             return (
                 f"firenet {command} needs {library}, which is not installed: "
-                f'pip install "firenet-jax[{EXTRAS[library]}]"'
+                f'pip install "firenet-jax[{extra}]"'
             )
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
         return "not enough memory: ask for a smaller sensor, chunk, crop or batch"
