@@ -314,14 +314,15 @@ def test_leaks_are_on_events_at_their_rate_and_not_all_at_once():
 
 def noisy_sensor(rate, on=0.2, off=0.17):
     phase = jax.random.uniform(jax.random.key(1), (H, W))
-    return plain_sensor(on, off)._replace(noise=jnp.array([rate, 0.25]), phase=phase)
+    return plain_sensor(on, off)._replace(noise=jnp.array([rate, 0.25, 0.0]), phase=phase)
 
 
 def test_shot_noise_has_its_rate_and_no_order():
     """0.6 events an interval: a Poisson process' chance of one or more would be 0.45."""
     ticks, polarity = jnp.int32(1000 * TICKS), jnp.ones(20_000)
     for expected in (0.0, 0.03, 0.6, 1.3):
-        run = module._shot_noise(jax.random.key(2), expected * polarity, polarity, ticks)
+        bits = jax.random.bits(jax.random.key(2), polarity.shape)
+        run = module._shot_noise(bits, expected * polarity, polarity, ticks)
         fired = np.asarray(run.count)
         assert abs(fired.mean() - min(expected, 1)) <= 4 * np.sqrt(expected / len(fired))
         place = np.asarray(run.first)[fired > 0] / (1000 * TICKS)
@@ -574,15 +575,71 @@ def test_half_of_the_sequences_that_stop_for_good_are_noisy_in_any_light(texture
     sensors, scenes, durations = module.random_setups(jax.random.key(4), textures, **settings)
     seconds = 1e-6 * np.asarray(durations)
     stopped = np.diff(scenes.pauses[:, 0, :2])[:, 0] > T * seconds
-    rate, light = np.asarray(sensors.noise).T
+    rate, light, drawn = np.asarray(sensors.noise).T
     noisy = light == 1
     assert 0.35 < stopped.mean() < 0.65 and not noisy[~stopped].any()
     assert 0.3 < noisy[stopped].mean() < 0.7
     in_a_window = (rate * seconds)[noisy]
-    assert (in_a_window > 0.0099).all() and (in_a_window < 0.701).all()
+    assert (in_a_window > 0.0199).all() and (in_a_window < 1.001).all()
+    assert not drawn[~noisy].any() and 0.3 < drawn[noisy].mean() < 0.7
     usual = sensors.noise[~noisy]
     np.testing.assert_array_equal(usual[:, 1], 0.25)
     assert (usual[:, 0] <= FAULTY.noise[1]).all()
+
+
+def test_noise_of_drawn_signs_adds_up_and_alternating_noise_does_not():
+    ticks = jnp.int32(1000)
+    grey = jnp.full((50, 60), 0.5)
+    settings = replace(module.SensorSettings(), noise=(300.0, 300.0))
+    alternating = module.random_sensor(jax.random.key(1), height=50, width=60, settings=settings)
+    drawn = alternating._replace(noise=jnp.array([300.0, 1.0, 1.0]))
+    sums = []
+    for sensor in (alternating, drawn):
+        state, votes = module.first_state(sensor, grey), []
+        for _ in range(100):
+            state, (_, noise) = module.step(sensor, state, grey, ticks)
+            votes.append(np.asarray(noise.count * noise.polarity))
+        sums.append(np.sum(votes, 0))
+        fired = np.abs(votes).mean()
+    assert np.abs(sums[0]).max() == 1
+    # A random walk of some thirty steps: its variance is their number.
+    assert 0.25 < fired < 0.35
+    np.testing.assert_allclose(sums[1].var(), 100 * fired, rtol=0.1)
+    assert abs(sums[1].mean()) < 0.5
+
+
+def test_a_clean_sensor_among_faulty_ones_is_the_papers(textures):
+    settings = replace(FAULTY, threshold_range=(0.3, 0.6), clean=0.5)
+    make = partial(module.random_sensor, height=8, width=9)
+    keys = jax.random.split(jax.random.key(0), 200)
+    sensors = jax.vmap(partial(make, settings=settings))(keys)
+    faulty = jax.vmap(partial(make, settings=replace(settings, clean=0.0)))(keys)
+    clean = np.asarray(sensors.noise[:, 0]) == 0
+    assert 0.4 < clean.mean() < 0.6
+    for name in ("on", "off", "refractory", "drift", "noise", "cutoff"):
+        mixed, usual = (np.asarray(getattr(s, name)) for s in (sensors, faulty))
+        np.testing.assert_array_equal(mixed[~clean], usual[~clean])
+    for thresholds in (np.asarray(sensors.on)[clean], np.asarray(sensors.off)[clean]):
+        assert np.ptp(thresholds, (1, 2)).max() == 0 and not np.asarray(sensors.drift)[clean].any()
+        assert abs(thresholds.mean() - 0.18) < 0.01 and abs(thresholds[:, 0, 0].std() - 0.03) < 0.01
+    # ... and makes the events of one without faults.
+    first = np.flatnonzero(clean)[0]
+    one = jax.tree.map(lambda leaf: leaf[first], sensors)
+    plain = make(keys[first])._replace(on=one.on[0, 0], off=one.off[0, 0])
+    rng = np.random.default_rng(0)
+    images = jnp.asarray(rng.uniform(size=(4, 8, 9)), jnp.float32)
+    states = [module.first_state(sensor, images[0]) for sensor in (one, plain)]
+    for image in images[1:]:
+        (seen, runs), (expected, wanted) = (
+            module.step(sensor, state, image, jnp.int32(5000))
+            for sensor, state in zip((one, plain), states, strict=True)
+        )
+        states = [seen, expected]
+        assert not runs[1].count.any() and wanted[0].count.sum() > 0
+        np.testing.assert_array_equal(runs[0].count, wanted[0].count)
+        np.testing.assert_allclose(runs[0].first, wanted[0].first, atol=TICKS)
+    with pytest.raises(ValueError, match="clean is 2"):
+        replace(settings, clean=2.0)
 
 
 @pytest.mark.slow

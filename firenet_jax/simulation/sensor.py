@@ -47,7 +47,8 @@ UNEVEN = 4.0  # times the mismatch of others: pixels of one edge fire one by one
 NEARLY_NOISELESS = 2 / 3
 # Of those that stop for good half have noise, so many events per pixel and window, as much in light
 # as in the dark: windows of a count hold nothing else then, and it says nothing of what is seen.
-AT_REST = (0.01, 0.7)
+# Half of it draws its signs: then it adds up to what looks like contrast, and is none.
+AT_REST = (0.02, 1.0)
 
 
 Fault = TypeVar("Fault", float, tuple[float, float])
@@ -96,6 +97,8 @@ class SensorSettings:
     """Hertz: bandwidth of the pixels, a first-order low-pass on log intensity."""
     cutoff_dark: float = 0.1
     """Bandwidth in the dark, in parts of that in full light; 1: it depends on no light."""
+    clean: float = 0.0
+    """Part of the sequences whose sensor has none of these faults, and the paper's thresholds."""
     mid_recording: bool = False
     """The sensor has run before: each pixel's reference begins anywhere within a threshold of the
     first rendering, instead of on it."""
@@ -108,6 +111,8 @@ class SensorSettings:
         for name in ("noise", "leak", "hot", "cutoff"):
             if _on(getattr(self, name)):
                 check_range(name, getattr(self, name))
+        if not 0 <= self.clean <= 1:
+            raise SettingsError(f"clean is {self.clean}, but is a part of the sequences, 0-1")
         if _on(self.hot) and self.hot[1] > 1:
             raise SettingsError(f"hot is {self.hot}, but is a part of the pixels: at most 1")
         if self.threshold is not None and not 0 < self.threshold < math.inf:
@@ -160,9 +165,8 @@ class Sensor(NamedTuple):
     off: jax.Array
     refractory: jax.Array | None  # () int32, ticks
     drift: jax.Array | None  # (H, W) log intensity per second, by which L seems to rise
-    noise: (
-        jax.Array | None
-    )  # (2,) events per second and pixel in the dark, part of it in full light
+    noise: jax.Array | None  # (3,) events per second and pixel in the dark, part of it in full
+    # light, and 1 where its signs are drawn, 0 where they alternate
     cutoff: jax.Array | None  # (2,) hertz in full light, and the part of it left in the dark
     phase: jax.Array | None  # (H, W) part of the first threshold already gone, where L drifts, and
     # whether noise begins with ON: else all pixels would begin with the same event
@@ -234,14 +238,14 @@ def random_sensor(
     refractory = jnp.float32(refractory) if refractory else None
     if settings.refractory_range is not None:
         refractory = log_uniform(settings.refractory_range)
-    return Sensor(
+    sensor = Sensor(
         on=on,
         off=off,
         refractory=None
         if refractory is None
         else jnp.round(refractory * 1e6 * TICKS).astype(jnp.int32),
         drift=drift,
-        noise=jnp.stack([log_uniform(settings.noise), jnp.float32(NOISE_IN_LIGHT)])
+        noise=jnp.stack([log_uniform(settings.noise), jnp.float32(NOISE_IN_LIGHT), jnp.float32(0)])
         if _on(settings.noise)
         else None,
         cutoff=jnp.stack([log_uniform(settings.cutoff), jnp.float32(settings.cutoff_dark)])
@@ -250,6 +254,29 @@ def random_sensor(
         phase=phase,
         start=start,
         key=noise_key,
+    )
+    if not settings.clean:
+        return sensor
+    clean_key, plain_key = jax.random.split(jax.random.fold_in(key, 2))
+    clean = jax.random.uniform(clean_key) < settings.clean
+    return _without_faults(sensor, clean, jax.random.normal(plain_key, (2,)))
+
+
+def _without_faults(sensor: Sensor, clean: jax.Array, spread: jax.Array) -> Sensor:
+    """The paper's sensor where `clean` () says so; spread: (2,) normal numbers."""
+
+    def unless(value, fault):
+        return None if fault is None else jnp.where(clean, value, fault)
+
+    on, off = THRESHOLD + SPREAD * spread
+    refractory = jnp.int32(round(REFRACTORY * 1e6 * TICKS))
+    return sensor._replace(
+        on=unless(on, sensor.on),
+        off=unless(off, sensor.off),
+        refractory=unless(refractory, sensor.refractory),
+        drift=unless(0.0, sensor.drift),
+        noise=unless(jnp.array([0.0, NOISE_IN_LIGHT, 0.0]), sensor.noise),
+        cutoff=unless(jnp.array([1e9, 1.0]), sensor.cutoff),  # so high that nothing is lost
     )
 
 
@@ -316,9 +343,12 @@ def step(
     runs, noise_on = (run,), state.noise_on
     if sensor.noise is not None and noise_on is not None:
         key = jax.random.fold_in(sensor.key, state.renderings)
-        rate, light = sensor.noise
+        rate, light, drawn = sensor.noise
         expected = seconds * rate * (1 - (1 - light) * image)
-        noise = _shot_noise(key, expected, jnp.where(noise_on, 1.0, -1.0), ticks)
+        bits = jax.random.bits(key, image.shape, jnp.uint32)
+        # The lowest bit has no part in when it fires: that is a float32, of 24 bits.
+        noise_on = jnp.where(drawn > 0, bits % 2 == 1, noise_on)
+        noise = _shot_noise(bits, expected, jnp.where(noise_on, 1.0, -1.0), ticks)
         noise_on = noise_on ^ (noise.count > 0)
         runs += (noise,)
     return SensorState(after, above, silent, noise_on, state.renderings + 1), runs
@@ -344,8 +374,9 @@ def _refractory(run: Run, silent: jax.Array, refractory: jax.Array, ticks: jax.A
     return Run(first, spacing, count, run.polarity), jnp.maximum(silent - ticks, 0)
 
 
-def _shot_noise(key: jax.Array, expected: jax.Array, polarity: jax.Array, ticks: jax.Array) -> Run:
-    """At most one event a pixel and interval, at any time in it; expected: (H, W) events.
+def _shot_noise(bits: jax.Array, expected: jax.Array, polarity: jax.Array, ticks: jax.Array) -> Run:
+    """At most one event a pixel and interval, at any time in it; expected: (H, W) events; bits:
+    (H, W) uint32, random.
 
     Its rate falls with light as in Hu, Liu and Delbruck, "v2e", CVPRW 2021. It moves a reference,
     as there, but one of its own: were it that of L, its polarity would hang on the last bits of L,
@@ -355,7 +386,7 @@ def _shot_noise(key: jax.Array, expected: jax.Array, polarity: jax.Array, ticks:
     # Not that of at least one event of a Poisson process, 1 - exp(-expected): as no interval has
     # more than one, the rate that was asked for would be missed by a quarter at 0.6.
     chance = jnp.minimum(expected, 1.0)
-    number = jax.random.bits(key, polarity.shape, jnp.uint32).astype(jnp.float32) * 2.0**-32
+    number = bits.astype(jnp.float32) * 2.0**-32
     fires = number < chance
     place = jnp.where(fires, number / jnp.where(fires, chance, 1.0), 0.0)
     first = (ticks.astype(jnp.float32) * place).astype(jnp.int32)
@@ -670,7 +701,8 @@ def _noisy_at_rest(
     noisy, share = jax.random.uniform(key, (2, len(duration)))
     rate = jnp.exp(low + (high - low) * share) / seconds
     chosen = (stopped & (noisy < 0.5))[:, None]
-    uniform = jnp.stack([rate, jnp.ones_like(rate)], -1)
+    drawn = noisy < 0.25
+    uniform = jnp.stack([rate, jnp.ones_like(rate), drawn.astype(rate.dtype)], -1)
     return jnp.where(chosen, uniform, noise)
 
 
