@@ -234,27 +234,18 @@ def random_sensor(
     start = None
     if settings.mid_recording:
         start = jax.random.uniform(jax.random.fold_in(key, 1), shape, minval=-off, maxval=on)
-    refractory = _or(settings.refractory, REFRACTORY)
-    refractory = jnp.float32(refractory) if refractory else None
     if settings.refractory_range is not None:
         refractory = log_uniform(settings.refractory_range)
-    sensor = Sensor(
-        on=on,
-        off=off,
-        refractory=None
-        if refractory is None
-        else jnp.round(refractory * 1e6 * TICKS).astype(jnp.int32),
-        drift=drift,
-        noise=jnp.stack([log_uniform(settings.noise), jnp.float32(NOISE_IN_LIGHT), jnp.float32(0)])
-        if _on(settings.noise)
-        else None,
-        cutoff=jnp.stack([log_uniform(settings.cutoff), jnp.float32(settings.cutoff_dark)])
-        if _on(settings.cutoff)
-        else None,
-        phase=phase,
-        start=start,
-        key=noise_key,
-    )
+    else:
+        refractory = jnp.float32(_or(settings.refractory, REFRACTORY))
+    silenced = settings.refractory_range is not None or settings.refractory != 0
+    noise = cutoff = None
+    if _on(settings.noise):
+        noise = jnp.stack([log_uniform(settings.noise), NOISE_IN_LIGHT, 0.0])
+    if _on(settings.cutoff):
+        cutoff = jnp.stack([log_uniform(settings.cutoff), settings.cutoff_dark])
+    refractory = jnp.round(refractory * 1e6 * TICKS).astype(jnp.int32) if silenced else None
+    sensor = Sensor(on, off, refractory, drift, noise, cutoff, phase, start, noise_key)
     if not settings.clean:
         return sensor
     clean_key, plain_key = jax.random.split(jax.random.fold_in(key, 2))
