@@ -384,7 +384,10 @@ BROAD = replace(
 # what stops for good, with nothing, and with noise that draws its signs: brightness still wandered.
 CLEAR = replace(
     BROAD,
-    steps=2100,
+    batch=4,
+    steps=2200,
+    renderings=24,
+    motion=(1.0, 24.0),
     seed=161,
     loss=replace(BROAD.loss, contrast=3.0, equalised=2.0, equalised_mse=16.0, lambda_tc=4.0),
     scene=replace(BROAD.scene, halt=0.45),
