@@ -61,7 +61,7 @@ FORMER = {
     "-i": "name the recording without an option",
     "--input_file": "name the recording without an option",
     "--path_to_model": "-c",
-    "--auto_hdr": "--auto-range",
+    "--auto_hdr": "--range extremes",
     "--fixed_duration": "-T MILLISECONDS",
     "--window_duration": "-T",
     "--window_size": "-N",

@@ -4,11 +4,15 @@ Images are (T, B, H, W) float32 as the network gives them; pictures are (T, B, H
 pictures (T, B, H, W, 3) uint8. Sharpened by an unsharp mask, stretched from an intensity range to
 0..255, clipped, if asked for smoothed, and rounded. (The original truncates to 8 bits, which
 darkens by half a level.)
+
+By default the range follows the images, because events tell contrast only in units of the sensor's
+threshold: how black and how white a scene is, no network can know.
 """
 
+import math
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +21,14 @@ from scipy.stats import norm
 
 from firenet_jax.errors import SettingsError
 
-HISTORY = 11  # images whose range the automatic one is the median of
+HISTORY = 11  # images whose ranges have a median, which is the range shown
+# Of the automatic range: the part of the pixels that may be darker, and that may be brighter; what
+# is left between them and black and white; its least width, so that noise is not blown up; how
+# many pixels, on a grid, it is read from.
+BEYOND, MARGIN, NARROWEST, SAMPLES = 0.005, 0.05, 0.35, 4096
+BORDER = 2  # pixels, which the unsharp mask brightens, as there is nothing beyond them
+
+Range = Literal["auto", "extremes", "fixed"]
 
 
 @dataclass(frozen=True)
@@ -26,8 +37,10 @@ class Display:
 
     unsharp: float = 0.3
     """Strength of the unsharp mask; 0 switches it off."""
-    auto_range: bool = False
-    """Stretch the contrast to the range of the last 11 images instead of the fixed 0 to 1."""
+    range: Range = "auto"
+    """What becomes black and white. auto: nearly the darkest and brightest of the last 11 images;
+    extremes: the darkest and brightest (--auto_hdr of the original program); fixed: 0 and 1, as the
+    original program does by default."""
     bilateral: float = 0.0
     """Smooth noise but not edges: sigma of a bilateral filter in grey levels, such as 25; 0
     switches it off."""
@@ -36,6 +49,10 @@ class Display:
         for name in ("unsharp", "bilateral"):
             if not getattr(self, name) >= 0:
                 raise SettingsError(f"{name} is {getattr(self, name)}, but must be 0 or more")
+        if self.range not in get_args(Range):
+            raise SettingsError(
+                f"range is {self.range!r}, but must be one of {', '.join(get_args(Range))}"
+            )
 
 
 class DisplayState(NamedTuple):
@@ -95,18 +112,22 @@ def display(
 ) -> tuple[DisplayState, jax.Array]:
     """(DisplayState, (T, B, H, W) float32) -> (DisplayState, (T, B, H, W) uint8).
 
-    With `auto_range`, black is the median over the last 11 images of clip(min, 0, 0.45) and white
-    that of clip(max, 0.55, 1); else black is 0 and white is 1, and the state is not used.
+    Black and white are the medians of the last 11 images' ranges (`Display.range`): of
+    `automatic_range`, or of clip(min, 0, 0.45) and clip(max, 0.55, 1). Where the range is fixed the
+    state is not used.
     valid: (T, B) bool; images that are not valid leave the state as it was. None: all are.
     """
     if settings.unsharp:
         images = unsharp_mask(images, settings.unsharp)
-    if not settings.auto_range:
+    if settings.range == "fixed":
         return state, _to_8_bit(images, settings.bilateral)
     if valid is None:
         valid = jnp.ones(images.shape[:2], bool)
-    lows = jnp.clip(images.min((-2, -1)), 0, 0.45)
-    highs = jnp.clip(images.max((-2, -1)), 0.55, 1)
+    if settings.range == "auto":
+        lows, highs = automatic_range(images)
+    else:
+        lows = jnp.clip(images.min((-2, -1)), 0, 0.45)
+        highs = jnp.clip(images.max((-2, -1)), 0.55, 1)
 
     def remember(state, inputs):
         low, high, keep = inputs  # (B,) each
@@ -120,6 +141,23 @@ def display(
     state, (low, high) = jax.lax.scan(remember, state, (lows, highs, valid))
     low, high = low[..., None, None], high[..., None, None]
     return state, _to_8_bit((images - low) / (high - low), settings.bilateral)
+
+
+def automatic_range(images: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(..., H, W) -> what becomes black and white in each, (...,) both.
+
+    Half a percent of the pixels may lie beyond either end, so that a hot pixel does not take the
+    range; a twentieth of the range is added at both ends; it is never narrower than `NARROWEST`.
+    """
+    height, width = images.shape[-2:]
+    if min(height, width) > 4 * BORDER:
+        images = images[..., BORDER:-BORDER, BORDER:-BORDER]
+    step = max(1, math.isqrt(height * width // SAMPLES))
+    sampled = images[..., ::step, ::step].reshape(*images.shape[:-2], -1)
+    low, high = jnp.quantile(sampled, jnp.array([BEYOND, 1 - BEYOND]), axis=-1)
+    half = jnp.maximum((0.5 + MARGIN) * (high - low), NARROWEST / 2)
+    middle = (low + high) / 2
+    return middle - half, middle + half
 
 
 def _to_8_bit(images: jax.Array, sigma: float) -> jax.Array:

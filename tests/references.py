@@ -67,6 +67,22 @@ def intensity_ranges(images):
     return result
 
 
+def automatic_ranges(images):
+    """`pictures.automatic_range` of each image, and the medians as above."""
+    bounds, result = [], []
+    for image in images:
+        if len(bounds) > 10:
+            bounds.pop(0)
+        values = np.sort(image[2:-2, 2:-2], axis=None).astype(float)
+        places = np.linspace(0, 1, len(values))
+        low, high = np.interp([0.005, 0.995], places, values)
+        low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
+        missing = max(0.0, 0.35 - (high - low))
+        bounds.append((low - missing / 2, high + missing / 2))
+        result.append(tuple(np.median(np.array(bounds), axis=0)))
+    return result
+
+
 def torch_firenet(params):
     """FireNet in PyTorch (NCHW) with our parameters: a function (state, tensor) -> (state, image).
 

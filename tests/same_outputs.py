@@ -41,7 +41,7 @@ reconstruct sample.txt -o cam.bag --rate 20
 reconstruct sample.txt -o cam.ros2 --rate 20 --flip
 reconstruct sample.txt -o at --at times.txt --names nanoseconds
 reconstruct sample.txt -o colour -N 300 --color --start 0.1 --stop 0.5 --hot-pixels auto
-reconstruct sample.txt -o range -N 300 --auto-range --pad 16 --no-recurrent --bilateral 25
+reconstruct sample.txt -o range -N 300 --range extremes --pad 16 --no-recurrent --bilateral 25
 reconstruct sample.txt -o frames --between-frames
 reconstruct set/train/000001.h5 -o between --between-frames
 reconstruct sample.txt set/train/000001.h5 set/train/000002.h5 -o several --batch 2 -N 200

@@ -128,7 +128,7 @@ def test_reconstruct_writes_each_kind_of_output(here, capsys, output):
 
 def test_every_option_is_accepted(here, capsys):
     (here / "hot.txt").write_text("1,1\n")
-    line = f"{RUN} -T 50 --step 25 --no-recurrent --bfloat16 --pad 16 --auto-range --unsharp 0 "
+    line = f"{RUN} -T 50 --step 25 --no-recurrent --bfloat16 --pad 16 --range extremes --unsharp 0 "
     line += "--hot-pixels hot.txt --flip --start 0.1 --stop 0.9 --fps 10 --sensor-size 30x40 "
     line += "--chunk 3 --batch 2 --overwrite"
     code, _, error = firenet(capsys, line)
@@ -294,7 +294,10 @@ def test_rates_in_words_are_never_nothing():
 
 
 def test_options_of_the_original_program_are_explained(here, capsys):
-    for line, said in (("-i a.txt -o out", "-i is"), (f"{RUN} --auto_hdr", "--auto-range here")):
+    for line, said in (
+        ("-i a.txt -o out", "-i is"),
+        (f"{RUN} --auto_hdr", "--range extremes here"),
+    ):
         line = line if line.startswith("reconstruct") else f"reconstruct {line}"
         code, _, error = firenet(capsys, line)
         assert code == 2 and said in error and len(error.splitlines()) == 1

@@ -1,5 +1,7 @@
 """Colours against scikit-image's, and a mosaic's channels against recordings of their own."""
 
+from typing import get_args
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +13,7 @@ from firenet_jax import colour
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.events import concatenate
 from firenet_jax.network import Weights, initial_state
-from firenet_jax.pictures import Display, display, initial_display_state
+from firenet_jax.pictures import Display, Range, display, initial_display_state
 from firenet_jax.reconstruction import Network, events_to_pictures, initial_session, reconstruct
 from firenet_jax.simulation.sensor import event_list, random_sensor
 from firenet_jax.tensors import normalise, pack, voxelise
@@ -61,8 +63,8 @@ def test_without_colour_the_picture_is_the_grey_one():
     assert np.abs(found - greys[..., None]).max() <= 1
 
 
-@pytest.mark.parametrize("auto_range", [False, True])
-def test_each_channel_is_reconstructed_as_a_recording_of_its_own(auto_range):
+@pytest.mark.parametrize("kind", get_args(Range))
+def test_each_channel_is_reconstructed_as_a_recording_of_its_own(kind):
     """Two recordings, in chunks of two windows; expected is one channel after another, at once."""
     rng, weights = np.random.default_rng(3), load_weights()
     windows = [
@@ -70,7 +72,7 @@ def test_each_channel_is_reconstructed_as_a_recording_of_its_own(auto_range):
         for n in (90, 200, 150, 120)
     ]
     size = {"height": HEIGHT, "width": WIDTH}
-    settings = Display(auto_range=auto_range)
+    settings = Display(range=kind)
     session, found = initial_session(2, HEIGHT, WIDTH, Network(color=True)), []
     for start in (0, 2):
         session, pictures = events_to_pictures(

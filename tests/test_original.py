@@ -21,7 +21,7 @@ from firenet_jax.windows import Windows
 HEIGHT, WIDTH = 180, 240
 
 
-def original(rows, count, weights, auto_range):
+def original(rows, count, weights, kind):
     """(N, 4) rows of t (s), x, y, p -> list of pictures (H, W) uint8."""
     import torch
 
@@ -38,7 +38,7 @@ def original(rows, count, weights, auto_range):
         with torch.no_grad():
             state, image = step(state, pad(tensor))
         images.append(references.unsharp(image[0, 0].numpy()))
-    ranges = references.intensity_ranges(images) if auto_range else [(0, 1)] * len(images)
+    ranges = references.intensity_ranges(images) if kind == "extremes" else [(0, 1)] * len(images)
     pictures = []
     for image, (low, high) in zip(images, ranges, strict=True):
         levels = np.clip(255 * (image - low) / (high - low), 0, 255).astype(np.uint8)
@@ -48,19 +48,19 @@ def original(rows, count, weights, auto_range):
 
 @pytest.mark.slow
 @pytest.mark.reference
-@pytest.mark.parametrize("auto_range", [False, True])
-def test_pictures_of_a_real_recording(tmp_path, reference, recordings, auto_range):
+@pytest.mark.parametrize("kind", ["fixed", "extremes"])
+def test_pictures_of_a_real_recording(tmp_path, reference, recordings, kind):
     pytest.importorskip("torch", reason="compares with PyTorch, which is not installed")
     path, checkpoint = recordings / "ecd_slider_depth", reference / "firenet_published.pth"
     count = 4000
     run(
         Reconstruct(
             (path,), tmp_path / "out", checkpoint, Windows(events=count),
-            network=Network(pad=16), display=Display(auto_range=auto_range),
+            network=Network(pad=16), display=Display(range=kind),
         )
     )  # fmt: skip
     rows = np.loadtxt(path / "events.txt")
-    expected = original(rows, count, convert(checkpoint), auto_range)
+    expected = original(rows, count, convert(checkpoint), kind)
     written = sorted((tmp_path / "out").glob("*.png"))
     assert len(written) == len(expected) == 13
     differences = []

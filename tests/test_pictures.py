@@ -6,6 +6,7 @@ import references
 from firenet_jax.events import Events
 from firenet_jax.pictures import (
     Display,
+    automatic_range,
     bilateral,
     display,
     event_pictures,
@@ -25,27 +26,58 @@ def test_unsharp_mask_equals_the_5x5_kernel():
 def test_fixed_range_clips_and_rounds():
     images = jnp.array([-0.5, 0.0, 0.5, 1.0, 1.5, 100.4 / 255, 100.6 / 255]).reshape(1, 1, 1, 7)
     state = initial_display_state(1)
-    same, pictures = display(state, images, settings=Display(unsharp=0))
+    same, pictures = display(state, images, settings=Display(unsharp=0, range="fixed"))
     assert pictures.dtype == jnp.uint8
     assert pictures.ravel().tolist() == [0, 0, 128, 255, 255, 100, 101]
     np.testing.assert_array_equal(same.low, state.low)
 
 
-def test_automatic_range_is_the_running_median():
+RANGES = {"auto": references.automatic_ranges, "extremes": references.intensity_ranges}
+
+
+@pytest.mark.parametrize("kind", RANGES)
+def test_range_is_the_running_median(kind):
     rng = np.random.default_rng(1)
-    images = rng.normal(rng.random((30, 1, 1, 1)), 0.4, (30, 1, 6, 7)).astype(np.float32)
+    contrast = rng.choice([0.01, 0.1, 0.4], (30, 1, 1, 1))
+    images = rng.normal(rng.random((30, 1, 1, 1)), contrast, (30, 1, 16, 27)).astype(np.float32)
     _, pictures = display(
-        initial_display_state(1), jnp.asarray(images), settings=Display(0, auto_range=True)
+        initial_display_state(1), jnp.asarray(images), settings=Display(0, range=kind)
     )
-    for t, (low, high) in enumerate(references.intensity_ranges(images[:, 0])):
+    for t, (low, high) in enumerate(RANGES[kind](images[:, 0])):
         expected = np.clip(255 * (images[t, 0] - low) / (high - low), 0, 255)
-        assert np.abs(np.asarray(pictures[t, 0], float) - expected).max() <= 0.5001
+        assert np.abs(np.asarray(pictures[t, 0], float) - expected).max() <= 0.501
 
 
-def test_automatic_range_survives_chunks_and_ignores_what_is_not_valid():
+def test_automatic_range_does_not_see_hot_pixels_and_does_not_blow_up_noise():
+    rng = np.random.default_rng(0)
+    scene = rng.uniform(0.2, 0.8, (1, 1, 90, 120)).astype(np.float32)
+    hot = scene.copy()
+    hot[..., rng.integers(0, 90, 10), rng.integers(0, 120, 10)] = 40.0
+    state, settings = initial_display_state(1), Display(unsharp=0)
+    without, seen = (
+        np.asarray(display(state, each, settings=settings)[1]) for each in (scene, hot)
+    )
+    np.testing.assert_allclose(seen[hot < 1], without[hot < 1], atol=1)
+    assert without.min() < 15 and without.max() > 240
+    noise = 0.5 + 0.01 * rng.normal(size=(1, 1, 90, 120)).astype(np.float32)
+    shown = np.asarray(display(state, noise, settings=settings)[1], float)
+    assert shown.std() == pytest.approx(255 * 0.01 / 0.35, rel=0.05)
+    assert shown.mean() == pytest.approx(127.5, abs=1)
+
+
+def test_automatic_range_of_a_large_image_is_read_from_a_part_of_it():
+    images = np.random.default_rng(3).beta(2, 5, (2, 1, 480, 640)).astype(np.float32)
+    low, high = (np.asarray(end) for end in automatic_range(jnp.asarray(images)))
+    every = np.quantile(images, [0.005, 0.995], axis=(-2, -1))
+    margin = 0.05 * (every[1] - every[0])
+    np.testing.assert_allclose([low, high], [every[0] - margin, every[1] + margin], atol=0.02)
+
+
+@pytest.mark.parametrize("kind", RANGES)
+def test_range_survives_chunks_and_ignores_what_is_not_valid(kind):
     rng = np.random.default_rng(2)
     images = jnp.asarray(rng.random((20, 2, 5, 5)), jnp.float32)
-    settings = Display(auto_range=True)
+    settings = Display(range=kind)
     whole, expected = display(initial_display_state(2), images, settings=settings)
     state, parts = initial_display_state(2), []
     for start in range(0, 20, 3):
@@ -63,7 +95,7 @@ def test_smoothed_pictures_keep_their_edges():
     images = np.where(np.arange(12) < 6, 0.2, 0.8) + rng.normal(0, 0.02, (2, 1, 9, 12))
     images = jnp.asarray(images, jnp.float32)
     _, pictures = display(
-        initial_display_state(1), images, settings=Display(unsharp=0, bilateral=25.0)
+        initial_display_state(1), images, settings=Display(unsharp=0, range="fixed", bilateral=25.0)
     )
     np.testing.assert_array_equal(pictures, np.round(255 * bilateral(jnp.clip(images, 0, 1))))
     noise = np.asarray(pictures)[..., 2:4].std(), 255 * np.asarray(images)[..., 2:4].std()
@@ -76,6 +108,11 @@ def test_smoothed_pictures_keep_their_edges():
 def test_impossible_settings(name, value):
     with pytest.raises(ValueError, match=f"{name} is"):
         Display(**{name: value})
+
+
+def test_unknown_range():
+    with pytest.raises(ValueError, match="range is 'hdr', but must be one of auto, extremes"):
+        Display(range="hdr")
 
 
 def test_event_pictures_show_the_sign_of_the_votes():

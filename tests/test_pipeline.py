@@ -154,7 +154,7 @@ def unfinished(weights, recording, output, monkeypatch):
 @EACH_WAY
 def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, weights, monkeypatch, at, color):
     recording = write_recording(tmp_path / "a.txt", 3050)
-    choices = {"display": Display(auto_range=True), "network": Network(color=color)}
+    choices = {"display": Display(range="extremes"), "network": Network(color=color)}
     run(settings(weights, (recording,), tmp_path / "whole", **choices))
     with monkeypatch.context() as patch:
         patch.setattr(jobs, "RESUME_EVERY", 0)
@@ -504,7 +504,7 @@ def test_all_that_pictures_depend_on_is_what_a_run_goes_on_with(tmp_path, weight
 
     for choice in (
         {"windows": Windows(events=90)}, {"network": Network(recurrent=False)},
-        {"display": Display(auto_range=True)}, {"preview": True}, {"hot_pixels": "auto"},
+        {"display": Display(range="extremes")}, {"preview": True}, {"hot_pixels": "auto"},
         {"flip": True}, {"start": 0.1}, {"stop": 0.5}, {"sensor_size": "30x30"},
         {"normalise": False},
     ):  # fmt: skip

@@ -78,7 +78,7 @@ def test_a_batch_gives_what_each_recording_gives_alone(tmp_path, weights):  # no
 @pytest.mark.parametrize("names", ["number", "nanoseconds"])
 def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, weights, monkeypatch, names):  # noqa: F811
     recording = write_recording(tmp_path / "a.txt", 1500)
-    choices = {"times": Times(rate=29.0), "display": Display(auto_range=True), "names": names}
+    choices = {"times": Times(rate=29.0), "display": Display(range="extremes"), "names": names}
     run(settings(weights, (recording,), tmp_path / "whole", **choices))
     with monkeypatch.context() as patch:
         patch.setattr(jobs, "RESUME_EVERY", 0)

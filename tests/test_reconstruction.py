@@ -1,4 +1,5 @@
 import re
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from test_tensors import random_events
 from firenet_jax.checkpoint import convert
 from firenet_jax.events import Events
 from firenet_jax.network import Weights, initial_params, initial_state
-from firenet_jax.pictures import Display, display, initial_display_state
+from firenet_jax.pictures import Display, Range, display, initial_display_state
 from firenet_jax.reconstruction import (
     Network,
     events_to_pictures,
@@ -109,8 +110,8 @@ def chunks_of(windows, chunk):
         yield pack(rows), np.arange(chunk)[:, None] < len(part), len(part)
 
 
-@pytest.mark.parametrize("auto_range", [False, True])
-def test_pictures_do_not_depend_on_the_chunk(auto_range):
+@pytest.mark.parametrize("kind", get_args(Range))
+def test_pictures_do_not_depend_on_the_chunk(kind):
     rng = np.random.default_rng(0)
     windows = [random_events(rng, 20 + 10 * k, 20, 24) for k in range(13)]
     weights = Weights(initial_params(jax.random.key(0)), True)
@@ -120,7 +121,7 @@ def test_pictures_do_not_depend_on_the_chunk(auto_range):
         for events, valid, count in chunks_of(windows, chunk):
             session, pictures = events_to_pictures(
                 weights, session, events, valid, height=20, width=24,
-                settings=Display(auto_range=auto_range),
+                settings=Display(range=kind),
             )  # fmt: skip
             shown.append(pictures[:count])
         runs.append((np.concatenate(shown), session))
@@ -149,7 +150,7 @@ def test_events_become_pictures_without_a_word_from_the_host():
     weights = Weights(initial_params(jax.random.key(0)), True)
     packed = pack([[random_events(np.random.default_rng(t), 50, 8, 9)] for t in range(3)])
     session = initial_session(1, 8, 9, Network())
-    size = {"height": 8, "width": 9, "settings": Display(auto_range=True)}
+    size = {"height": 8, "width": 9, "settings": Display(range="extremes")}
     lowered = events_to_pictures.lower(weights, session, packed, np.ones((3, 1), bool), **size)
     program = lowered.compile().as_text()
     assert " while(" in program  # the scan; so the names below would be found too
