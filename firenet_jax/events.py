@@ -14,11 +14,9 @@ from typing import NamedTuple, overload
 import numpy as np
 
 from firenet_jax.errors import RecordingError
-from firenet_jax.settings import LONGEST_SIDE
 
 BINS = 5  # of an event tensor: what a window is split into along time (Eq. 1)
-LATEST = 2**53  # microseconds, 285 years: float64 seconds lose microseconds beyond
-REACH = LONGEST_SIDE
+MAX_TIME = 2**53  # microseconds, 285 years: float64 seconds lose microseconds beyond
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -149,7 +147,7 @@ def event_number(row: int) -> str:
     return f"event {row + 1}"
 
 
-MOST_BAD = 1e-3  # of the rows may be left out: beyond, the fault is not that of single events
+MAX_BAD_SHARE = 1e-3  # of the rows may be left out: beyond, the fault is not that of single events
 
 
 def checked(
@@ -197,7 +195,7 @@ def checked(
             bad = bad | _outside(events, height, width)
             fewest = bad | _out_of_order(events.t, bad, last)
             count = int(fewest.sum())
-            if strict or dropped + count > MOST_BAD * (rows + len(events)):
+            if strict or dropped + count > MAX_BAD_SHARE * (rows + len(events)):
                 if first:  # whoever stops before the damage never meets it
                     yield events.select(slice(first))
                 dropped = 0  # the error says enough

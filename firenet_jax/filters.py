@@ -11,14 +11,14 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from firenet_jax.errors import RecordingError, SettingsError
-from firenet_jax.events import LATEST, Events, Recording, until_damage
+from firenet_jax.events import MAX_TIME, Events, Recording, until_damage
 from firenet_jax.storage.files import check_readable
 
 
 def check_span(start: float | None, stop: float | None) -> None:
     """Raises SettingsError unless these seconds, None for no bound, are a part of a recording."""
     for name, value in (("start", start), ("stop", stop)):
-        if value is not None and not abs(value) < LATEST / 1e6:
+        if value is not None and not abs(value) < MAX_TIME / 1e6:
             raise SettingsError(f"{name} is {value} s, but must be a time: leave it out for none")
     if start is not None and start < 0:
         raise SettingsError(f"start is {start} s, but counts from the beginning: 0 or more")

@@ -26,7 +26,7 @@ from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.events import Events, Recording, concatenate
 from firenet_jax.windows import Window, Windows, cut
 
-FASTEST = 1_000_000  # images per second: times are whole microseconds
+MAX_RATE = 1_000_000  # images per second: times are whole microseconds
 
 
 class Step(NamedTuple):
@@ -175,5 +175,5 @@ def grid(first: int, rate: float, from_zero: bool = False) -> Grid:
 
 def check_rate(rate: float) -> None:
     """Raises SettingsError for a rate that is not above 0, or more than one a microsecond."""
-    if not 0 < rate <= FASTEST:
-        raise SettingsError(f"rate is {rate:g}, but must be more than 0, at most {FASTEST:,} per s")
+    if not 0 < rate <= MAX_RATE:
+        raise SettingsError(f"rate is {rate:g}, but must be above 0, at most {MAX_RATE:,} per s")

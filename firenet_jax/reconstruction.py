@@ -37,7 +37,7 @@ from firenet_jax.pictures import (
     initial_display_state,
 )
 from firenet_jax.tensors import (
-    IN_LISTS,
+    PACKED_SPECS,
     Packed,
     capacity,
     in_groups,
@@ -478,6 +478,6 @@ def events_to_pictures(
         return after, pictures
 
     if mesh is not None:
-        specs = REPLICATED, BATCH, IN_LISTS, TIME_BATCH, TIME_BATCH
+        specs = REPLICATED, BATCH, PACKED_SPECS, TIME_BATCH, TIME_BATCH
         one_device = on_each_device(one_device, specs, (BATCH, TIME_BATCH), mesh)
     return one_device(weights, session, events, valid, steps)

@@ -132,7 +132,7 @@ def pack(
 
 
 # How the devices of `pack_for_devices` share its arrays.
-IN_LISTS = Packed._make([BATCH] * 5 + [TIME_BATCH] * 2)
+PACKED_SPECS = Packed._make([BATCH] * 5 + [TIME_BATCH] * 2)
 
 
 def pack_for_devices(

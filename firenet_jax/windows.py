@@ -17,10 +17,10 @@ import tyro
 from firenet_jax.errors import RecordingError, SettingsError, logger
 from firenet_jax.events import Events, Recording, concatenate, counted
 
-APART = 3_600_000_000  # microseconds between events of one clock, or events and frames, at most
-MOST = 2**31 - 1
-LONGEST = 40.0  # milliseconds of a window where none are chosen: 25 pictures per second at least
-PICTURES = 20  # of a recording that is too short for so many of these, at least
+MAX_GAP = 3_600_000_000  # microseconds between two events, or events and frames, of one clock
+MAX_NUMBER = 2**31 - 1
+DEFAULT_LONGEST = 40.0  # milliseconds: at least 25 pictures per second
+MIN_WINDOWS = 20  # of a short recording: its windows are shorter than DEFAULT_LONGEST
 
 
 class Window(NamedTuple):
@@ -58,8 +58,10 @@ class Windows:
             )
         for name in ("events", "events_per_pixel", "duration", "step", "longest"):
             value = getattr(self, name)
-            if value is not None and not 0 < value <= MOST:
-                raise SettingsError(f"{name} is {value}, but must be more than 0, at most {MOST}")
+            if value is not None and not 0 < value <= MAX_NUMBER:
+                raise SettingsError(
+                    f"{name} is {value}, but must be more than 0, at most {MAX_NUMBER}"
+                )
         if self.step is not None:
             if self.between_frames:
                 raise SettingsError(
@@ -94,9 +96,9 @@ def usual(chunks: Iterable[Events]) -> Windows:
     for events in chunks:
         first = int(events.t[0]) if first is None else first
         last = int(events.t[-1])
-        if last - first >= PICTURES * 1000 * LONGEST:
-            return Windows(longest=LONGEST)
-    return Windows(longest=max(((last or 0) - (first or 0)) // PICTURES, 1) / 1000)
+        if last - first >= MIN_WINDOWS * 1000 * DEFAULT_LONGEST:
+            return Windows(longest=DEFAULT_LONGEST)
+    return Windows(longest=max(((last or 0) - (first or 0)) // MIN_WINDOWS, 1) / 1000)
 
 
 def in_words(windows: Windows, pixels: int) -> str:
@@ -227,7 +229,7 @@ def _by_time(path, chunks: Iterator[Events], begin: int | None, spans) -> Iterat
         yield _window(held, a, b, stop)
         if ended and b == len(held):
             return
-        if held.t[b] - stop > APART:  # a broken time: there may be billions of windows up to it
+        if held.t[b] - stop > MAX_GAP:  # a broken time: there may be billions of windows up to it
             raise RecordingError(
                 f"{path}: no event from {stop / 1e6:.6f} to {held.t[b] / 1e6:.6f} s, more than an "
                 "hour: leave one side out with --start or --stop, or use --events-per-pixel"
@@ -255,7 +257,7 @@ def _frame_spans(path, times: np.ndarray, first: int) -> Iterator[tuple[int, int
 
     So a recording whose frames begin late or end early has no window of all the rest.
     """
-    if max(times[0] - first, first - times[-1]) > APART:
+    if max(times[0] - first, first - times[-1]) > MAX_GAP:
         raise RecordingError(
             f"{path}: its frames are from {times[0] / 1e6:.6f} to {times[-1] / 1e6:.6f} s, its "
             f"events begin at {first / 1e6:.6f} s: they are not on one clock; use "

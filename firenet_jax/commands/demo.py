@@ -31,7 +31,7 @@ from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import bar
 from firenet_jax.storage.video import check_output, followed, open_writer
 
-WINDOWS = 10  # simulated and reconstructed at once
+WINDOWS_AT_ONCE = 10  # simulated and reconstructed at once
 RENDERINGS = 5  # in a window, with at most half a pixel of motion between two
 WARM_UP = 10  # windows from a zero state that the numbers leave out
 CAPTION = 16  # pixels above the pictures
@@ -163,8 +163,8 @@ def pictures(
     for `count` windows of `period` microseconds."""
     state = initial_state(1, height, width)
     sensor_state = last = None
-    for start in range(0, count, WINDOWS):
-        bounds = np.round(np.arange(start, start + WINDOWS + 1) * period).astype(np.int32)
+    for start in range(0, count, WINDOWS_AT_ONCE):
+        bounds = np.round(np.arange(start, start + WINDOWS_AT_ONCE + 1) * period).astype(np.int32)
         sensor_state, simulated = simulate(
             sensor, scene, bounds[:, None], sensor_state,
             height=height, width=width, renderings=RENDERINGS,
@@ -175,7 +175,7 @@ def pictures(
             last = images[0], simulated.images[0, 0]
         last, shown = _show(simulated, images, last)
         shown = jax.device_get(shown)
-        for t in range(min(WINDOWS, count - start)):
+        for t in range(min(WINDOWS_AT_ONCE, count - start)):
             greys = [np.stack([grey[t]] * 3, -1) for grey in (shown.images, shown.truth)]
             yield np.concatenate([shown.events[t], *greys], 1), shown.errors[t]
 

@@ -76,8 +76,8 @@ CUTS = {
 }
 # which can hold frames
 SUFFIXES = (".h5", ".hdf5", ".hdf", ".zip", ".bag", ".mcap", ".aedat", ".aedat4")
-SMALLEST = 17  # pixels of a side: what CW-SSIM's filters need
-WIDEST = 2000  # pixels of a video
+MIN_SIDE = 17  # pixels of a side: what CW-SSIM's filters need
+MAX_VIDEO_WIDTH = 2000  # pixels of a video
 
 
 @dataclass(frozen=True)
@@ -307,7 +307,7 @@ def plan(name: str, recording: Recording, settings: Evaluate) -> Plan:
         raise Gap(
             f"frames are {width}x{height}, the sensor is {recording.width}x{recording.height}"
         )
-    if min(height, width) < SMALLEST:
+    if min(height, width) < MIN_SIDE:
         raise Gap(f"{width}x{height} pixels are too small to be compared")
     times = np.asarray(frames.times, np.int64)
     if (np.diff(times) < 0).any():
@@ -667,7 +667,7 @@ def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
         path = settings.output / "videos" / f"{plan.name}.mp4"
         path.parent.mkdir(exist_ok=True)
         step = np.median(np.diff([int(times[number]) for number, _ in clip])) / 1e6
-        coarser = -(-len(clip[0][1]) * plan.recording.width // WIDEST)
+        coarser = -(-len(clip[0][1]) * plan.recording.width // MAX_VIDEO_WIDTH)
         rows = (
             np.concatenate([report.in_colours(image) for image in images], 1)[::coarser, ::coarser]
             for _, images in clip

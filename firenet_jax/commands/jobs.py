@@ -46,7 +46,7 @@ from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import Bytes
 from firenet_jax.storage.screen import Screen
 from firenet_jax.storage.video import FolderWriter, VideoWriter
-from firenet_jax.tensors import IN_LISTS, Packed, pack_for_devices
+from firenet_jax.tensors import PACKED_SPECS, Packed, pack_for_devices
 from firenet_jax.windows import Windows, cut
 
 Writer = FolderWriter | VideoWriter | ArraysWriter | BagWriter
@@ -342,7 +342,7 @@ def computed(
         if mesh:
             session = jax.device_put(session, sharding(BATCH, mesh))
             events = jax.tree.map(
-                lambda a, spec: jax.device_put(a, sharding(spec, mesh)), events, IN_LISTS
+                lambda a, spec: jax.device_put(a, sharding(spec, mesh)), events, PACKED_SPECS
             )
         session, shown = events_to_pictures(
             weights, session, events, chunk.valid, chunk.looks, height=height, width=width,

@@ -45,12 +45,12 @@ from firenet_jax.storage.video import (
     followed,
     open_writer,
 )
-from firenet_jax.windows import LONGEST, Windows, in_words, usual
+from firenet_jax.windows import DEFAULT_LONGEST, Windows, in_words, usual
 
-# Settings that the pictures do not depend on (on the chunk only in float32's last bits), or that
-# are told in another way.
-ELSEWHERE = ("recordings", "output", "weights", "fps", "speed", "chunk", "batch", "overwrite")
-ELSEWHERE += ("columns", "strict", "processes", "process", "show")
+# Settings that are not part of a run's record: the pictures do not depend on them (on the chunk
+# only in float32's last bits), or the record holds them in another form.
+UNRECORDED = ("recordings", "output", "weights", "fps", "speed", "chunk", "batch", "overwrite")
+UNRECORDED += ("columns", "strict", "processes", "process", "show")
 
 
 @dataclass(frozen=True)
@@ -292,10 +292,10 @@ def windows_for(recording: Recording, settings: Reconstruct) -> tuple[Windows, f
         try:
             windows = usual(until_damage(part_of(recording, settings)))
         except RecordingError:  # told when its events are read, so that others are done
-            windows = Windows(longest=LONGEST)
-        longest = windows.longest or LONGEST
-        if settings.speed is None and longest < LONGEST / 2:  # gone in 0.4 s
-            speed = longest / LONGEST
+            windows = Windows(longest=DEFAULT_LONGEST)
+        longest = windows.longest or DEFAULT_LONGEST
+        if settings.speed is None and longest < DEFAULT_LONGEST / 2:  # gone in 0.4 s
+            speed = longest / DEFAULT_LONGEST
     return windows, speed
 
 
@@ -356,7 +356,8 @@ def describe(
     if settings.output.suffix in VIDEOS:
         told |= {"fps": settings.fps, "speed": settings.speed}
     in_a_bag = settings.output.suffix in (".bag", ".ros2")
-    return recorded(settings, ELSEWHERE if in_a_bag else (*ELSEWHERE, "topic", "frame_id"), **told)
+    of_bags = () if in_a_bag else ("topic", "frame_id")
+    return recorded(settings, (*UNRECORDED, *of_bags), **told)
 
 
 # ---- What is said at the end

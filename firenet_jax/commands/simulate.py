@@ -48,7 +48,7 @@ from firenet_jax.simulation.scenes import (
     video,
 )
 from firenet_jax.simulation.sensor import (
-    LONGEST,
+    MAX_INTERVAL,
     SensorSettings,
     event_list,
     random_sensor,
@@ -72,14 +72,14 @@ from firenet_jax.storage.runs import (
 ROWS = 1 << 16  # events in a chunk of the file, and so many are written at once
 GZIP = 4  # for 50 % more time than level 1: events take 10 % less room, flow 25 %
 FLOW_BITS = 11  # of the fastest pixel's flow, see `rounded_flow`
-POOL = 32  # sequences that choose from the same textures, and how many these are
+SEQUENCES_PER_POOL = 32  # sequences that choose from the same textures, and how many these are
 TEXTURES, TEXTURE_SIZE = 64, 320
-FEW = 8  # sequences after which their mean size is that of all, more or less
+MIN_SAMPLE = 8  # sequences after which their mean size is that of all, more or less
 LONGEST_SCENE = 60.0  # seconds; a scene's clock is float32, which by then ticks in 4 us
 PATIENCE = 600  # seconds that processes wait for the first one
 CLIP_SUFFIXES = (".h5", ".hdf5")
 # on which no sequence depends
-ELSEWHERE = ("output", "sequences", "validation", "video", "overwrite", "processes", "process")
+UNRECORDED = ("output", "sequences", "validation", "video", "overwrite", "processes", "process")
 OF_SCENES = ("sequences", "validation", "seconds", "fps", "images", "scene")  # not of a video
 
 
@@ -352,13 +352,12 @@ def write_sequences(
             if done:
                 # The first few sequences say little about the size of all.
                 rest = len(missing) - done
-                _check_room(
-                    settings.output, used / done * (rest if done >= FEW else min(rest, FEW))
-                )
+                expected = rest if done >= MIN_SAMPLE else min(rest, MIN_SAMPLE)
+                _check_room(settings.output, used / done * expected)
             key = jax.random.key(settings.seed)
             for fold in (part, number):
                 key = jax.random.fold_in(key, fold)
-            textures = _textures(settings.images, settings.seed, part, number // POOL)
+            textures = _textures(settings.images, settings.seed, part, number // SEQUENCES_PER_POOL)
             events += write_sequence(
                 path,
                 *sequence(key, textures, settings, sensor, height, width),
@@ -442,7 +441,7 @@ def describe(settings: Simulate) -> dict:
     """All that a sequence depends on, apart from its number; ready for JSON."""
     return recorded(
         settings,
-        but=ELSEWHERE,
+        but=UNRECORDED,
         images=None if settings.images is None else settings.images.resolve(),
         sensor_size=settings.sensor_size or "240x180",
         version=importlib.metadata.version("firenet-jax"),
@@ -551,10 +550,10 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
                     seconds = frame.pts * frame.time_base
                 first = seconds if first is None else first
                 time = round((seconds - first) * 1_000_000)
-                if last is not None and not 0 < time - last <= LONGEST:
+                if last is not None and not 0 < time - last <= MAX_INTERVAL:
                     raise PictureError(
                         f"{path}: picture {number + 1} comes {(time - last) * 1e-6:g} s after the "
-                        f"one before, expected more than 0 and up to {LONGEST * 1e-6:.1f}: "
+                        f"one before, expected more than 0 and up to {MAX_INTERVAL * 1e-6:.1f}: "
                         "convert the clip to a constant rate"
                     )
                 last = time

@@ -16,11 +16,11 @@ from typing import Literal
 import numpy as np
 
 from firenet_jax.errors import RecordingError, SettingsError, logger
-from firenet_jax.events import LATEST, Events, Recording, counted
+from firenet_jax.events import MAX_TIME, Events, Recording, counted
 from firenet_jax.instants import Grid, check_rate, grid
 
 UNITS = {"s": 10**6, "ms": 10**3, "us": 1, "ns": Decimal("0.001")}  # microseconds
-WORDS = {
+UNIT_OF = {
     "s": "s", "sec": "s", "secs": "s", "second": "s", "seconds": "s",
     "ms": "ms", "msec": "ms", "millisecond": "ms", "milliseconds": "ms",
     "us": "us", "µs": "us", "μs": "us", "usec": "us", "microsecond": "us", "microseconds": "us",
@@ -29,7 +29,7 @@ WORDS = {
 COLUMN = re.compile(r"t|time|timestamps?|stamps?")  # without its unit
 NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-zµμ]*)", re.IGNORECASE)
 SPLIT = re.compile(r"[\s,;]+")
-NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 LARGEST = 1 << 28  # bytes of a file of times
 
 
@@ -171,7 +171,7 @@ def _from_file(
             )
         logger.warning(
             "%s: its %s are taken as %s, %s (--unit and --since say it otherwise)",
-            path, counted(len(times), "time"), NAMES[name],
+            path, counted(len(times), "time"), UNIT_NAMES[name],
             "since the first event" if relative else "on the recording's clock",
         )  # fmt: skip
     return np.unique(times)
@@ -200,17 +200,17 @@ def read_times(path: Path) -> tuple[list[str], str | None, bool | None]:
         if line.startswith("#"):
             continue
         behind = found[2].lower() if found else None
-        if behind == "" and len(fields) == 2 and fields[1].lower() in WORDS:  # "33.3 ms"
+        if behind == "" and len(fields) == 2 and fields[1].lower() in UNIT_OF:  # "33.3 ms"
             behind = fields[1].lower()
-        if found is None or (behind and behind not in WORDS):
+        if found is None or (behind and behind not in UNIT_OF):
             raise RecordingError(
                 f"{path}, line {number}: expected a time, found {line[:40]!r}: write one a line"
             )
-        if behind and WORDS[behind] != (unit or WORDS[behind]):
+        if behind and UNIT_OF[behind] != (unit or UNIT_OF[behind]):
             raise RecordingError(f"{path}, line {number}: is in {behind}, but before it in {unit}")
         if behind and numbers and unit is None:
             raise RecordingError(f"{path}, line {number}: names a unit, but those before do not")
-        unit = WORDS[behind] if behind else unit
+        unit = UNIT_OF[behind] if behind else unit
         numbers.append(found[1])
     if not numbers:
         raise RecordingError(f"{path}: holds no times: write one a line")
@@ -227,11 +227,11 @@ def _header(line: str, column: int, unit: str | None, since_start: bool | None):
     joined = re.sub(r"\s*[\[(]\s*(\w+)\s*[\])]", r"_\1", words)  # timestamp [ns] -> timestamp_ns
     for place, name in enumerate(SPLIT.split(joined)):
         stem, _, behind = name.rpartition("_")
-        if behind in WORDS and COLUMN.fullmatch(stem):
-            return place, WORDS[behind], since_start
+        if behind in UNIT_OF and COLUMN.fullmatch(stem):
+            return place, UNIT_OF[behind], since_start
         if COLUMN.fullmatch(name):
             column = place
-    named = {WORDS[word] for word in re.findall(r"\w+", words) if word in WORDS}
+    named = {UNIT_OF[word] for word in re.findall(r"\w+", words) if word in UNIT_OF}
     return column, named.pop() if len(named) == 1 else unit, since_start
 
 
@@ -240,15 +240,15 @@ def _scaled(path: Path, numbers: list[str], unit: str) -> np.ndarray:
     try:
         times = [int((Decimal(number) * UNITS[unit]).to_integral_value()) for number in numbers]
     except (InvalidOperation, OverflowError):
-        times = [LATEST]
+        times = [MAX_TIME]
     if max(map(abs, times)) >= 2**62:
-        times = [min(max(time, -LATEST), LATEST) for time in times]
+        times = [min(max(time, -MAX_TIME), MAX_TIME) for time in times]
     return np.array(times, np.int64)
 
 
 def _span(chunks: Iterable[Events], whole: bool) -> tuple[int | None, int]:
     """Times of the first event and, if asked for, of the last one before any damage."""
-    first, last = None, LATEST
+    first, last = None, MAX_TIME
     try:
         for events in chunks:
             first = int(events.t[0]) if first is None else first

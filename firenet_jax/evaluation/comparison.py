@@ -18,9 +18,9 @@ from firenet_jax.events import Frames, Recording
 from firenet_jax.instants import Grid
 from firenet_jax.windows import Windows
 
-BATCH = 8  # images that are compared at once
+IMAGES_AT_ONCE = 8  # images that are compared at once
 STILLS = (0.2, 0.55, 0.9)  # places of the pictures that are kept, in the part that counts
-CLIP = 60  # pictures of a video
+CLIP_LENGTH = 60  # pictures of a video
 
 COMPARED = [name for name in METRICS if name not in ("lpips", "temporal_error")]
 
@@ -89,7 +89,7 @@ class Measurements:
     def __init__(self, plan: Plan, kind: Kind, learned: lpips.Lpips | None):
         self.plan = plan
         self.kind: Kind = kind
-        small = min(plan.recording.height, plan.recording.width) < lpips.SMALLEST
+        small = min(plan.recording.height, plan.recording.width) < lpips.MIN_SIDE
         self.learned = None if small else learned
         self.no_lpips = "no weights" if learned is None else "pictures too small"
         self.places: list[int] = []
@@ -166,8 +166,8 @@ class Measurements:
 
 
 def _whole(batch: np.ndarray) -> np.ndarray:
-    """(n, ...) -> (BATCH, ...), the last entry repeated: one size compiles once."""
-    return np.concatenate([batch, np.repeat(batch[-1:], BATCH - len(batch), 0)])
+    """(n, ...) -> (IMAGES_AT_ONCE, ...), the last entry repeated: one size compiles once."""
+    return np.concatenate([batch, np.repeat(batch[-1:], IMAGES_AT_ONCE - len(batch), 0)])
 
 
 @jax.jit
@@ -182,7 +182,7 @@ class Pictures:
         count = plan.last - plan.first
         self.numbers = plan.numbers
         self.wanted = [plan.first + int(share * count) for share in STILLS]
-        self.begin = plan.first + max(0, (count - CLIP) // 2)
+        self.begin = plan.first + max(0, (count - CLIP_LENGTH) // 2)
         self.kept: dict[str, list] = {"stills": [], "clip": []}
 
     def add(self, batch: list[Comparison], compared: tuple[np.ndarray, np.ndarray]) -> None:
@@ -191,7 +191,7 @@ class Pictures:
             if self.wanted and entry.place >= self.wanted[0]:
                 self.wanted = [place for place in self.wanted if place > entry.place]
                 self.kept["stills"].append(picture)
-            if entry.place >= self.begin and len(self.kept["clip"]) < CLIP:
+            if entry.place >= self.begin and len(self.kept["clip"]) < CLIP_LENGTH:
                 self.kept["clip"].append(picture)
 
     def arrays(self) -> dict[str, np.ndarray]:

@@ -30,7 +30,7 @@ from firenet_jax.storage.files import named
 from firenet_jax.tensors import normalise, pack, voxelise
 from firenet_jax.windows import Window
 
-NAMES = ("firenet", "e2vid", "hf", "mr")
+METHODS = ("firenet", "e2vid", "hf", "mr")
 
 
 class Method(NamedTuple):
@@ -81,8 +81,8 @@ def load(
             raise SettingsError(f"weights are given, but {name} is not among the methods: add it")
     found: list[Method | Missing] = []
     for name in names:
-        if name not in NAMES:
-            raise SettingsError(f"no method {name!r}: choose from {', '.join(NAMES)}")
+        if name not in METHODS:
+            raise SettingsError(f"no method {name!r}: choose from {', '.join(METHODS)}")
         if name == "firenet" and weights:
             found += [firenet(named(path).stem, load_weights(path)) for path in weights]
         elif name == "firenet":

@@ -384,7 +384,7 @@ def _divided(detail: jax.Array, band: int) -> jax.Array:
     return detail / (sigma + near)
 
 
-DETAIL = (0.8, 1.6)  # pixels: Gaussian blurs, each of which leaves a band of detail
+DETAIL_SIGMAS = (0.8, 1.6)  # pixels: Gaussian blurs, each of which leaves a band of detail
 
 
 @jax.jit
@@ -403,14 +403,14 @@ def detail(image: jax.Array, truth: jax.Array) -> jax.Array:
     window = _gaussian(2.5, radius=6)
 
     def bands(picture):
-        for sigma in DETAIL:
+        for sigma in DETAIL_SIGMAS:
             blur = _gaussian(sigma, radius=math.ceil(3 * sigma))
             smooth = _filter(picture, blur, blur, "symmetric")
             yield jnp.sqrt(_filter((picture - smooth) ** 2, window, window, "symmetric") + 1e-6)
             picture = smooth
 
     pairs = zip(bands(image), bands(truth), strict=True)
-    return sum((_mean(jnp.abs(a - b)) for a, b in pairs), jnp.float32(0)) / len(DETAIL)
+    return sum((_mean(jnp.abs(a - b)) for a, b in pairs), jnp.float32(0)) / len(DETAIL_SIGMAS)
 
 
 @jax.jit
@@ -554,7 +554,7 @@ def temporal_error(
     return _mean(mask * jnp.abs(image - warped))
 
 
-BLOCK = 14  # pixels on a side of what moves as one in `event_correlation`
+PATCH = 14  # pixels on a side of what moves as one in `event_correlation`
 
 
 @jax.jit
@@ -575,9 +575,9 @@ def event_correlation(image: jax.Array, votes: jax.Array) -> jax.Array:
     Raises SettingsError for images smaller than a block.
     """
     image, votes = _compared(image, votes)
-    rows, columns = (side // BLOCK for side in image.shape[-2:])
+    rows, columns = (side // PATCH for side in image.shape[-2:])
     if not rows * columns:
-        raise SettingsError(f"{BLOCK}x{BLOCK} pixels at least are needed, not {image.shape[-2:]}")
+        raise SettingsError(f"{PATCH}x{PATCH} pixels at least are needed, not {image.shape[-2:]}")
     blur = _gaussian(0.7, radius=3)
     image, votes = (_filter(picture, blur, blur, "symmetric") for picture in (image, votes))
     difference = (-0.5, 0.0, 0.5)
@@ -586,8 +586,8 @@ def event_correlation(image: jax.Array, votes: jax.Array) -> jax.Array:
     )
 
     def summed(values):
-        whole = values[..., : rows * BLOCK, : columns * BLOCK]
-        return whole.reshape(*values.shape[:-2], rows, BLOCK, columns, BLOCK).sum((-3, -1))
+        whole = values[..., : rows * PATCH, : columns * PATCH]
+        return whole.reshape(*values.shape[:-2], rows, PATCH, columns, PATCH).sum((-3, -1))
 
     # The normal equations of two unknowns; a little is added so that a flat block has a solution.
     least = 1e-6 * summed(down**2 + across**2) + 1e-12

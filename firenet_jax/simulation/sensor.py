@@ -39,10 +39,11 @@ EPS = 0.001
 THRESHOLD, SPREAD, REFRACTORY = 0.18, 0.03, 1e-3  # as in the paper, where nothing is said
 NOISE_IN_LIGHT = 0.25  # of that in the dark
 TICKS = 1024  # in a microsecond
-AT_ONCE = 4  # events of a pixel in one pass over the picture: fewer passes, less memory traffic
-LONGEST = 2**31 // TICKS - 1  # microseconds between two renderings
+EVENTS_PER_PASS = 4  # of a pixel, in one pass over the picture: saves memory traffic
+MAX_INTERVAL = 2**31 // TICKS - 1  # microseconds between two renderings
 SLOW, SWIFT = (0.02, 0.3), (16.0, 90.0)  # pixels a window, of rare sequences
-UNEVEN = 4.0  # times the mismatch of others: pixels of one edge fire one by one, not together
+# Slow sequences have this many times the mismatch, so that the pixels of an edge fire one by one.
+SLOW_MISMATCH = 4.0
 # Of the slow ones: next to no faults, so that single events can be trusted.
 NEARLY_NOISELESS = 2 / 3
 # Of those that stop for good half have noise, so many events per pixel and window, as much in light
@@ -412,10 +413,10 @@ def event_list(sensor: Sensor, renderings: Iterable[tuple[int, ArrayLike]]) -> I
             state, previous = _first(sensor, image), time
             continue
         duration = time - previous
-        if not 0 < duration <= LONGEST:
+        if not 0 < duration <= MAX_INTERVAL:
             raise SettingsError(
                 f"renderings at {previous} and {time} us: each must come after the last, by at "
-                f"most {LONGEST} us"
+                f"most {MAX_INTERVAL} us"
             )
         state, runs, fired = _listed(sensor, state, image, jnp.int32(duration))
         if int(fired):
@@ -540,9 +541,9 @@ def _votes(planes: jax.Array, low, runs, passed: jax.Array, total: jax.Array) ->
 
     def several(carry):
         number, planes = carry
-        for n in range(AT_ONCE):
+        for n in range(EVENTS_PER_PASS):
             planes = vote(planes, first, number + n)
-        return number + AT_ONCE, planes
+        return number + EVENTS_PER_PASS, planes
 
     start = jnp.int32(0), list(planes)
     _, voted = jax.lax.while_loop(lambda carry: carry[0] < most, several, start)
@@ -595,10 +596,10 @@ def random_setups(
     time the fastest point moves by so many pixels as `motion` says (least, greatest; log-uniform),
     but 1 to 300 ms.
     windows: in a sequence, over which pauses are placed and the speed is measured.
-    slow, swift: parts of the sequences in which next to nothing moves (`SLOW` pixels a window, the
-    pixels' thresholds differ `UNEVEN` times as much, and most have a fiftieth of noise and leaks),
-    and in which much does before a blank ground
-    (`SWIFT` pixels, from one rendering to the next by more than one).
+    slow: share of the sequences with hardly any motion: `SLOW` pixels per window, `SLOW_MISMATCH`
+    times the mismatch, and in most of them a fiftieth of the noise and leaks.
+    swift: share of the sequences with very fast motion (`SWIFT` pixels per window, more than one
+    between renderings) over a plain background.
     Where the sensor has noise, half of the scenes that stop for good are noisy (`AT_REST`).
     Raises SettingsError where `motion` is more than a pixel from one rendering to the next, the
     bound of Gehrig et al., "Video to Events", CVPR 2020, or slow and swift leave nothing.
@@ -666,7 +667,7 @@ def _paces(
 
 def _uneven(sensors: Sensor, kind: jax.Array, is_slow: jax.Array, slow: float) -> Sensor:
     """Thresholds of a slow sequence's pixels differ more, and most have next to no noise."""
-    apart = jnp.where(is_slow, UNEVEN, 1.0)[:, None, None]
+    apart = jnp.where(is_slow, SLOW_MISMATCH, 1.0)[:, None, None]
 
     def uneven(thresholds):
         mean = thresholds.mean((-2, -1), keepdims=True)

@@ -33,7 +33,7 @@ from firenet_jax.tensors import Packed, pack, voxelise
 from firenet_jax.warp import warp
 
 SUFFIXES = (".h5", ".hdf5")
-ONE_IN = 20  # of so many files one is for validation, as in the paper
+FILES_PER_VALIDATION = 20  # of so many files one is for validation, as in the paper
 THREADS, AHEAD = 2, 4  # that read, and batches that wait; HDF5 lets one thread in at a time
 
 
@@ -64,7 +64,7 @@ class Augment:
             raise SettingsError(f"voxel_noise is {self.voxel_noise}, but must be 0 or more")
 
 
-NOTHING = Augment(flip=0.0, pauses=0.0, hot_pixels=0.0, voxel_noise=0.0)
+NO_AUGMENT = Augment(flip=0.0, pauses=0.0, hot_pixels=0.0, voxel_noise=0.0)
 """For validation."""
 
 
@@ -107,7 +107,7 @@ def split(folder: Path) -> tuple[list[Path], list[Path]]:
     held = [path for path in files if names[path].startswith("validation/")]
     if not held:
         order = sorted(files, key=lambda path: hashlib.sha256(names[path].encode()).digest())
-        held = sorted(order[: max(1, len(files) // ONE_IN)])
+        held = sorted(order[: max(1, len(files) // FILES_PER_VALIDATION)])
     kept = [path for path in files if path not in set(held)]
     if not kept:
         raise RecordingError(

@@ -72,7 +72,7 @@ class Loss:
                 raise SettingsError(f"{name} is {getattr(self, name)}, but must be 0 or more")
 
 
-STILL = 0.3  # pixels by which nothing moves more before an image whose detail counts
+MAX_STILL_MOTION = 0.3  # pixels by which nothing moves more before an image whose detail counts
 DISTANCES = {
     "l1": metrics.l1,
     "centred": metrics.centred,
@@ -128,7 +128,7 @@ def sequence_loss(
     per_image, terms = reconstruction_loss(images, truths, settings)
     if settings.detail:
         moved = jnp.where(visible, jnp.abs(displacements).max(-1), 0.0).max((-2, -1))
-        terms["detail"] = jnp.where(moved < STILL, metrics.detail(images, truths), 0.0)
+        terms["detail"] = jnp.where(moved < MAX_STILL_MOTION, metrics.detail(images, truths), 0.0)
         per_image += settings.detail * terms["detail"]
     terms = {"reconstruction": per_image, **terms}
     loss = per_image.sum(0).mean()

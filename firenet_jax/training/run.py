@@ -35,7 +35,7 @@ from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage import runs
 from firenet_jax.storage.files import locked, write_text
 from firenet_jax.storage.progress import bar
-from firenet_jax.training.batches import NOTHING, batches, split
+from firenet_jax.training.batches import NO_AUGMENT, batches, split
 from firenet_jax.training.log import Log
 from firenet_jax.training.settings import Train
 from firenet_jax.training.step import (
@@ -48,7 +48,7 @@ from firenet_jax.training.step import (
 )
 
 VALIDATION = 8  # batches
-FREE = "log_every", "save_every", "validate_every"  # say nothing about what is computed
+UNRECORDED = "log_every", "save_every", "validate_every"  # say nothing about what is computed
 
 
 def run(settings: Train, stop: int | None = None) -> None:
@@ -197,7 +197,7 @@ def sources_of(settings: Train, done: int) -> tuple[Iterator, list[Callable[[], 
         training = batches(
             files, **shape, chain=chain, augment=augment, seed=settings.seed, first=done
         )
-        fixed = batches(others, **shape, augment=NOTHING, seed=settings.seed)
+        fixed = batches(others, **shape, augment=NO_AUGMENT, seed=settings.seed)
         validation = [_dealt(next(fixed)) for _ in range(VALIDATION)]
         fixed.close()
         return map(_dealt, training), [partial(lambda data: data, data) for data in validation]
@@ -244,7 +244,7 @@ def _check_settings(folder: Path, settings: Train) -> None:
     """Raises OutputError if the folder holds a run of other settings.
 
     Options that the run there does not know, as it is older than they are, count as their defaults.
-    Those of `FREE` may change.
+    Those of `UNRECORDED` may change.
     """
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder} is a file, but a run needs a folder: choose another --output")
@@ -255,7 +255,7 @@ def _check_settings(folder: Path, settings: Train) -> None:
     found, now = runs.completed(found, _record(Train(folder))), _record(settings)
     done = (folder / "checkpoints" / str(found["steps"])).is_dir()
     longer = isinstance(found["steps"], int) and found["steps"] < settings.steps
-    if longer and done and not runs.differences(found, now, but=(*FREE, "steps")):
+    if longer and done and not runs.differences(found, now, but=(*UNRECORDED, "steps")):
         logger.warning(
             "%s: its %d steps are done: it goes on to %d, with the rate of a run so long",
             folder, found["steps"], settings.steps,
@@ -263,7 +263,7 @@ def _check_settings(folder: Path, settings: Train) -> None:
         return
     runs.check_same(
         found, now, f"{folder} holds a run with other settings",
-        "choose another --output, or go on with the same settings", but=FREE,
+        "choose another --output, or go on with the same settings", but=UNRECORDED,
     )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from firenet_jax.training.batches import Augment, is_set
 from firenet_jax.training.losses import DISTANCES, Loss
 from firenet_jax.training.step import StepSettings
 
-SMALLEST = 11  # pixels on a side of what validation measures: SSIM's window
+MIN_CROP = 11  # pixels on a side of what validation measures: SSIM's window
 
 
 @dataclass(frozen=True)
@@ -131,9 +131,9 @@ class Train:
             )
         if not any(getattr(self.loss, name) for name in DISTANCES):
             raise SettingsError(f"no distance has a weight: pass one of {', '.join(DISTANCES)}")
-        if self.crop < SMALLEST:
+        if self.crop < MIN_CROP:
             raise SettingsError(
-                f"crop is {self.crop} pixels, but images smaller than {SMALLEST} cannot be judged"
+                f"crop is {self.crop} pixels, but images smaller than {MIN_CROP} cannot be judged"
             )
         check_range("motion", self.motion)
         check_rare(self.slow, self.swift)

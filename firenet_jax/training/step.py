@@ -40,7 +40,7 @@ from firenet_jax.tensors import normalise
 from firenet_jax.training.losses import Loss, sequence_loss
 
 TEXTURE = 256  # pixels on a side of a texture
-NEAR = 9  # pixels on a side of the surroundings in which an event tells of a pixel
+NEIGHBOURHOOD = 9  # pixels on a side of the surroundings in which an event tells of a pixel
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ def images_of(
 def near_events(tensors: jax.Array) -> jax.Array:
     """(T, B, H, W, bins) -> (T, B, H, W) bool: where events were, in this window or one before."""
     there = jnp.abs(tensors).max(-1)
-    around = (1, 1, NEAR, NEAR)
+    around = (1, 1, NEIGHBOURHOOD, NEIGHBOURHOOD)
     there = jax.lax.reduce_window(there, 0.0, jax.lax.max, around, (1, 1, 1, 1), "SAME")
     return jax.lax.cummax(there) > 0
 
