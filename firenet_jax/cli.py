@@ -1,7 +1,7 @@
-"""Command line -> one command: firenet demo | reconstruct | live | train | evaluate and others.
+"""Command line -> one command: firenet demo | reconstruct | live | train | evaluate | ...
 
-A command is a frozen dataclass of settings and a `run(settings)` beside it, in a module that is
-imported only when the command is named: `firenet --help` loads no jax.
+A command is a module with a frozen dataclass of settings and a function `run(settings)`. It is
+imported only when the command is called, so `firenet --help` does not load jax.
 """
 
 import contextlib
@@ -26,18 +26,18 @@ COMMANDS = {
         "Reconstruct",
         "recordings -> video or pictures",
     ),
-    "live": ("firenet_jax.commands.live", "Live", "a camera, a stream -> pictures at once"),
+    "live": ("firenet_jax.commands.live", "Live", "a camera or a stream -> live pictures"),
     "info": ("firenet_jax.commands.info", "Info", "what a recording holds"),
     "simulate": (
         "firenet_jax.commands.simulate",
         "Simulate",
-        "training data, or a video file -> events",
+        "random scenes or a video file -> events",
     ),
-    "train": ("firenet_jax.commands.train", "Train", "simulated sequences -> weights"),
+    "train": ("firenet_jax.commands.train", "Train", "sequences or recordings -> weights"),
     "evaluate": (
         "firenet_jax.commands.evaluate",
         "Evaluate",
-        "methods beside camera frames -> report",
+        "recordings with frames -> a comparison of methods",
     ),
     "convert": ("firenet_jax.commands.convert", "Convert", "PyTorch checkpoint -> weights.npz"),
     "export": (
@@ -47,7 +47,7 @@ COMMANDS = {
     ),
 }
 
-# What only some commands need: the library, and the extra of this package that brings it.
+# Libraries that only some commands need -> the extra of this package that installs them.
 EXTRAS = {
     "optax": "train",
     "orbax": "train",
@@ -56,7 +56,7 @@ EXTRAS = {
     "skimage": "evaluate",
 }
 
-# Options of the original program (rpg_e2vid) and what does the same here.
+# Options of the original program (rpg_e2vid) -> the equivalent here.
 FORMER = {
     "-i": "name the recording without an option",
     "--input_file": "name the recording without an option",
@@ -79,21 +79,21 @@ def usage() -> str:
     lines = [f"  firenet {name:13} {summary}" for name, (_, _, summary) in COMMANDS.items()]
     return "\n".join(
         [
-            "firenet_jax: recordings of event cameras become video (FireNet in JAX)",
+            "firenet_jax: event camera recordings become video (FireNet in JAX)",
             "",
             *lines,
             "",
-            "firenet COMMAND --help explains a command, with examples. FIRENET_DEBUG=1 in the",
-            "environment shows where an error came from.",
+            "firenet COMMAND --help explains a command and gives examples. With FIRENET_DEBUG=1",
+            "in the environment, errors show a traceback.",
         ]
     )
 
 
 def _return_freed_memory() -> None:
-    """Has glibc give large freed blocks back at once.
+    """Makes glibc return large freed blocks to the system at once.
 
-    By default it comes to keep blocks of up to 32 MB in a heap for each thread; those heaps
-    fragment, and a long reconstruction grows by a third of its memory before it settles.
+    By default it starts to keep blocks of up to 32 MB in one heap per thread. These heaps fragment,
+    and a long reconstruction grows by a third before its memory settles.
     """
     if sys.platform == "linux":
         with contextlib.suppress(OSError, AttributeError):  # another C library
@@ -107,9 +107,9 @@ REPORT = (
 
 
 def _keep_freed_memory() -> None:
-    """Tells glibc to keep memory for the same again, as a training step asks for it.
+    """Makes glibc keep freed memory, because each training step allocates the same again.
 
-    Else each step gets some hundred MB anew from the system, which takes a fifth of its time.
+    Otherwise each step requests some hundred MB from the system, which takes a fifth of its time.
     """
     if sys.platform == "linux":
         with contextlib.suppress(OSError, AttributeError):
