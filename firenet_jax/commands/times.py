@@ -1,9 +1,9 @@
-"""What is asked for (a file, a rate, triggers, frames) -> times in a recording's microseconds.
+"""A file of times, a rate, triggers or frames -> times in microseconds on a recording's clock.
 
-A file of times has one a line, in its first column or the one that a first line of names calls
-time, t or timestamp. Their unit and what they count from are those that are named, by an option,
-behind a number (`33.3ms`) or in the first line (`#timestamp [ns]`); else those for which most of
-them lie within the recording, and a notice says which.
+A file of times has one time per line, in its first column or in the one that a header line names
+time, t or timestamp. Unit and origin are given by an option, after a number (`33.3ms`) or in the
+header (`#timestamp [ns]`); otherwise those for which most times lie within the recording are
+taken, and a notice says which.
 """
 
 import re
@@ -35,27 +35,28 @@ LARGEST = 1 << 28  # bytes of a file of times
 
 @dataclass(frozen=True)
 class Times:
-    """Images at given times, in place of one for each window. Choose at most one way."""
+    """Images at given times instead of one per window. Choose at most one of --rate, --at,
+    --between-frames and --triggers."""
 
     rate: float | None = None
-    """So many images per second, from the first event on."""
+    """Images per second, from the first event on."""
     from_zero: bool = False
-    """With --rate: on the grid through time 0 of the recording's clock."""
+    """With --rate: count from time 0 of the recording's clock instead of the first event."""
     at: Path | None = None
-    """At the times in this file, one a line."""
+    """Images at the times in this file, one per line."""
     unit: Literal["s", "ms", "us", "ns"] | None = None
-    """Of the times in the file, where it does not name it."""
+    """With --at: unit of the times, if the file does not state it."""
     since: Literal["start", "zero"] | None = None
-    """Times in the file count from the first event (start), or are those of the recording's own
-    clock (zero). Without: as they fit."""
+    """With --at: whether times count from the first event (start) or are on the recording's clock
+    (zero). Default: whichever fits."""
     between_frames: bool = False
-    """At the times of the camera's frames."""
+    """Images at the times of the camera's frames."""
     triggers: bool = False
-    """At the edges that the recording has of its trigger inputs."""
+    """Images at the edges of the camera's trigger inputs."""
     trigger_edges: Literal["rising", "falling", "both"] = "rising"
-    """Which of them."""
+    """With --triggers: which edges."""
     trigger_input: int | None = None
-    """Only those of this input."""
+    """With --triggers: only this input."""
 
     def __post_init__(self):
         ways = [self.rate, self.at, self.between_frames or None, self.triggers or None]
@@ -91,11 +92,11 @@ class Times:
 def times_of(
     wanted: Times, recording: Recording, chunks: Iterable[Events]
 ) -> np.ndarray | Grid | None:
-    """The times at which images are wanted, in order; None where none are.
+    """The times of the images, in order; None: one image per window.
 
-    chunks: the recording's events, after filters of time; read up to the first for a rate, to the
-    end for a file whose times have to be told apart. Raises RecordingError for a file of times
-    that cannot be used and for a recording that has no frames or triggers.
+    chunks: the recording's events, after filters in time; read up to the first event for a rate,
+    and to the end to determine the unit of a file. Raises RecordingError for an invalid file of
+    times, and for a recording without frames or triggers.
     """
     if not wanted.wanted:
         return None
@@ -178,8 +179,8 @@ def _from_file(
 
 
 def read_times(path: Path) -> tuple[list[str], str | None, bool | None]:
-    """A file -> (its numbers as they are written, their unit, whether they are since the start),
-    None for what it does not say. Raises RecordingError naming the line that has no time."""
+    """A file -> (numbers as written, unit, whether they count from the start); None for what it
+    does not state. Raises RecordingError, which names the invalid line."""
     try:
         if path.stat().st_size > LARGEST:
             raise RecordingError(f"{path}: is larger than {LARGEST >> 20} MB: no list of times")
@@ -218,7 +219,7 @@ def read_times(path: Path) -> tuple[list[str], str | None, bool | None]:
 
 
 def _header(line: str, column: int, unit: str | None, since_start: bool | None):
-    """A first line -> (the column of the time, its unit, whether since the start)."""
+    """A header line -> (column of the time, unit, whether times count from the start)."""
     words = line.lstrip("#").strip().lower()
     if re.search(r"since (the )?(start|first event|beginning)|relative", words):
         since_start = True
@@ -236,7 +237,7 @@ def _header(line: str, column: int, unit: str | None, since_start: bool | None):
 
 
 def _scaled(path: Path, numbers: list[str], unit: str) -> np.ndarray:
-    """Decimal numbers -> int64 microseconds, to the nearest one; exact."""
+    """Decimal numbers -> int64 microseconds, correctly rounded."""
     try:
         times = [int((Decimal(number) * UNITS[unit]).to_integral_value()) for number in numbers]
     except (InvalidOperation, OverflowError):
@@ -247,7 +248,7 @@ def _scaled(path: Path, numbers: list[str], unit: str) -> np.ndarray:
 
 
 def _span(chunks: Iterable[Events], whole: bool) -> tuple[int | None, int]:
-    """Times of the first event and, if asked for, of the last one before any damage."""
+    """The times of the first event and, if `whole`, of the last event before any damage."""
     first, last = None, MAX_TIME
     try:
         for events in chunks:
