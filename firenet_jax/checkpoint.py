@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
 
 from firenet_jax.errors import CheckpointError
 from firenet_jax.events import BINS
@@ -134,7 +135,7 @@ def _load_npz(path: Path) -> Weights:
     if normalise is None or normalise.shape != () or normalise.dtype != bool:
         raise CheckpointError(f"{path} does not say whether tensors are normalised; {TRY}")
     _check(path, flat, "holds no FireNet")
-    return Weights(params=_unflatten(flat), normalise=bool(normalise))
+    return Weights(params=unflatten_dict(flat, sep="/"), normalise=bool(normalise))
 
 
 def _check(path: Path, flat: dict[str, np.ndarray], problem: str) -> None:
@@ -158,26 +159,9 @@ def _check(path: Path, flat: dict[str, np.ndarray], problem: str) -> None:
             raise CheckpointError(f"{path} {problem}: it has no place for {name!a}; {TRY}")
 
 
-def _flatten(tree, prefix: str = "") -> dict[str, np.ndarray]:
+def _flatten(tree) -> dict[str, np.ndarray]:
     """{"gru1": {"gates": {"bias": b}}} -> {"gru1/gates/bias": b}"""
-    flat = {}
-    for name, value in tree.items():
-        if hasattr(value, "items"):
-            flat |= _flatten(value, f"{prefix}{name}/")
-        else:
-            flat[prefix + name] = np.asarray(value)
-    return flat
-
-
-def _unflatten(flat: dict[str, np.ndarray]) -> dict:
-    tree: dict = {}
-    for name, value in flat.items():
-        *groups, leaf = name.split("/")
-        place = tree
-        for group in groups:
-            place = place.setdefault(group, {})
-        place[leaf] = value
-    return tree
+    return {name: np.asarray(value) for name, value in flatten_dict(tree, sep="/").items()}
 
 
 # ---- PyTorch
@@ -243,7 +227,7 @@ def convert(path: str | Path) -> Weights:
         flat[f"{layer}/bias"] = np.concatenate(biases)
 
     refuse_unused(tensors, prefix, path, "FireNet", TRY)
-    return Weights(params=_unflatten(flat), normalise=names.normalise)
+    return Weights(params=unflatten_dict(flat, sep="/"), normalise=names.normalise)
 
 
 def original_names(weights: Weights) -> tuple[str, dict[str, np.ndarray]]:

@@ -89,46 +89,34 @@ def usage() -> str:
     )
 
 
-def _return_freed_memory() -> None:
-    """Makes glibc return large freed blocks to the system at once.
-
-    By default it starts to keep blocks of up to 32 MB in one heap per thread. These heaps fragment,
-    and a long reconstruction grows by a third before its memory settles.
-    """
-    if sys.platform == "linux":
-        with contextlib.suppress(OSError, AttributeError):  # another C library
-            ctypes.CDLL(None).mallopt(-3, 1 << 22)  # M_MMAP_THRESHOLD
-
-
+# Settings of glibc's malloc (number, value). By default it starts to keep freed blocks of up to
+# 32 MB in one heap per thread. These heaps fragment, and a long reconstruction grows by a third.
+RETURN_FREED_MEMORY = ((-3, 1 << 22),)  # M_MMAP_THRESHOLD
+# A training step allocates the same again: requesting it from the system takes a fifth of its time.
+KEEP_FREED_MEMORY = (  # no heaps of threads (M_ARENA_MAX), M_MMAP_MAX, M_TRIM_THRESHOLD
+    (-8, 1), (-4, 0), (-1, 2**31 - 1),
+)  # fmt: skip
+HUGE_PAGES = "glibc.malloc.hugetlb=1"
 REPORT = (
     "firenet: this is a fault of firenet, not of yours: please report it, with the command and all "
     "these lines"
 )
 
 
-def _keep_freed_memory() -> None:
-    """Makes glibc keep freed memory, because each training step allocates the same again.
-
-    Otherwise each step requests some hundred MB from the system, which takes a fifth of its time.
-    """
+def _set_malloc(choices: tuple[tuple[int, int], ...]) -> None:
     if sys.platform == "linux":
-        with contextlib.suppress(OSError, AttributeError):
-            tell = ctypes.CDLL(None).mallopt
-            tell(-8, 1)  # M_ARENA_MAX: those of threads keep no large blocks
-            tell(-4, 0)  # M_MMAP_MAX
-            tell(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
-
-
-HUGE_PAGES = "glibc.malloc.hugetlb=1"
+        with contextlib.suppress(OSError, AttributeError):  # another C library
+            for choice in choices:
+                ctypes.CDLL(None).mallopt(*choice)
 
 
 def program() -> int:
-    """What `firenet` runs: `main`, after glibc was told to take large blocks in huge pages.
+    """The entry point of `firenet`: `main`, with glibc set to use huge pages for large blocks.
 
-    XLA asks for its memory anew at each call. In pages of 4 kB that is some ten thousand page
-    faults a window at 640x480: a twelfth of the time of a reconstruction, a seventh of a training
-    step's. glibc takes the choice from the environment of a starting program, so this one starts
-    again, once.
+    XLA allocates its memory anew at each call. With pages of 4 kB that is some ten thousand page
+    faults per window at 640x480: a twelfth of the time of a reconstruction, a seventh of a training
+    step. glibc reads this setting from the environment at the start of a program, so this one
+    starts itself again, once.
     """
     if sys.platform == "linux" and "GLIBC_TUNABLES" not in os.environ:
         os.environ["GLIBC_TUNABLES"] = HUGE_PAGES
@@ -137,10 +125,10 @@ def program() -> int:
 
 
 def sentence(error: Exception, command: str) -> str | None:
-    """What a person is told who can put it right; None where the fault is this package's."""
+    """The message for an error that the user can fix; None for a bug in this package."""
     if isinstance(error, ModuleNotFoundError):
         library = (error.name or "").partition(".")[0]
-        if library in EXTRAS:  # several extras bring some: a command's own has its name
+        if library in EXTRAS:  # a library may be in several extras: prefer the command's own
             extra = command if command in EXTRAS.values() else EXTRAS[library]
             return (
                 f"firenet {command} needs {library}, which is not installed: "
@@ -158,8 +146,8 @@ def sentence(error: Exception, command: str) -> str | None:
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command; returns the exit code.
 
-    What a user can put right (`FirenetError`), the system's refusals (OSError) and a lack of memory
-    are one sentence. Anything else is a fault of this package and shows its traceback.
+    A `FirenetError`, an OSError or a lack of memory prints one sentence. Any other exception is a
+    bug in this package and shows its traceback.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments or arguments[0] in ("-h", "--help"):
@@ -178,7 +166,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     logging.basicConfig(format="firenet: %(message)s", level=logging.WARNING)
     name, rest = arguments[0], arguments[1:]
-    _keep_freed_memory() if name == "train" else _return_freed_memory()
+    _set_malloc(KEEP_FREED_MEMORY if name == "train" else RETURN_FREED_MEMORY)
     module, settings, _ = COMMANDS[name]
     for option in (word.partition("=")[0] for word in rest):
         if name == "reconstruct" and option in FORMER:
