@@ -43,7 +43,7 @@ def share(process: int | None, processes: int | None) -> tuple[int, int]:
     if process is None or processes is None:
         if asked is not None or process is not None:
             raise SettingsError(
-                "several processes need both --processes and --process, unless a launcher sets "
+                "several processes need both of --processes and --process, unless a launcher sets "
                 "them (Slurm's srun, Open MPI, an indexed Kubernetes job)"
             )
         return 0, 1

@@ -59,9 +59,8 @@ class Train:
     windows: int = 21
     """Windows per step, L + 1 in the paper."""
     chain: int = 1
-    """Truncated back-propagation through time: the state is carried through up to this many steps,
-    and gradients stop between them. The sequences of a batch differ in length, in a geometric
-    series (64 with a batch of 4: 3, 8, 23, 64)."""
+    """Truncated back-propagation through time: carry the state through up to this many steps.
+    Sequences of a batch differ in length, in a geometric series (64, batch 4: 3, 8, 23, 64)."""
     renderings: int = 5
     """Renderings per window."""
     motion: tuple[float, float] = (1.25, 2.5)
