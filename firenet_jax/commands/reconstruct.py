@@ -72,7 +72,7 @@ class Reconstruct:
     """Text, zip, HDF5, ECD or EVREAL folder, .bin, .dat, .raw, .aedat, .aedat4, .es, ROS bag."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """A folder (png files and timestamps.txt), or a name that ends in .mp4, .gif, .h5 (float32
-    images), .bag or .ros2. For several recordings, a folder of that name with one each."""
+    images), .bag or .ros2. Several recordings: one each, in a folder of that name."""
     weights: Annotated[Path | None, tyro.conf.arg(aliases=["-c"])] = None
     """Weights: .npz, a published PyTorch checkpoint, or the folder of a training run. Default: the
     built-in weights."""
