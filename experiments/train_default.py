@@ -494,6 +494,9 @@ def report(folder: Path) -> None:
     for name in STAGES:
         if (folder / name).is_dir():  # else it ran elsewhere, and was reported there
             stages[name] = record(folder / name)
+        if name not in stages:
+            print(f"{name}: left out, as there is neither its folder nor a record of it")
+            continue
         validations = stages[name]["validations"]
         steps = [done + entry["step"] for entry in validations]
         axes.plot(steps, [entry["ssim"] for entry in validations], "o-", label=name)

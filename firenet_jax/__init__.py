@@ -1,4 +1,4 @@
-"""firenet_jax: recordings of event cameras become video, by FireNet as pure JAX functions.
+"""firenet_jax: event camera recordings -> video, by FireNet as pure JAX functions.
 
     reconstruct   readers -> events -> windows -> tensors -> network (scan) -> pictures -> video
     train         textures -> scenes -> sensor -> (dataset) -> train (losses) -> weights
@@ -11,11 +11,11 @@
     for tensors, times in fj.event_tensors(recording, events_per_pixel=0.35):
         state, images = fj.reconstruct(weights, state, tensors)
 
-`fj.recording(t, x, y, p, width=240, height=180)` makes one of arrays. Images at given times, in
-microseconds, whatever the windows: `for times, images in fj.images_at(weights, recording, times)`.
+`fj.recording(t, x, y, p, width=240, height=180)` makes a recording from arrays.
+`fj.images_at(weights, recording, times)` yields images at times of your choice, in microseconds.
 
-Names are loaded when they are first used (PEP 562), so importing this package loads no jax.
-No module has the name of a function here: importing the module would hide the function.
+Names are loaded on first use (PEP 562), so importing this package does not load jax. No module
+shares its name with a public function: importing the module would hide the function.
 """
 
 import importlib

@@ -1,9 +1,9 @@
-"""Maps, kernels, biases -> maps: ConvGRU and residual block, gradients of their own included.
+"""Maps, kernels, biases -> maps: ConvGRU and residual block as fused operations, with gradients.
 
-Equal to what their layers (`convolution.layer`) give one by one, and to those layers' gradients.
-As one, what a convolution's sums become on their way into the next one takes no time on a CPU: maps
-that go through memory once more for each sum, product and slope take as long as the convolutions
-themselves. Maps are (B, H, W, 16) float32, parameters (kernel, bias), 3x3.
+They equal the same layers applied one by one (`convolution.layer`), gradients included. Fused,
+because on a CPU separate element-wise operations between two convolutions, each of which reads and
+writes whole maps, take as long as the convolutions themselves. Maps are (B, H, W, 16) float32,
+parameters (kernel, bias), 3x3.
 """
 
 from functools import partial
@@ -28,13 +28,13 @@ Parameters = tuple[jax.Array, jax.Array]
 def gru(h: jax.Array, x: jax.Array, gates: Parameters, candidate: Parameters) -> jax.Array:
     """r, z = sigmoid(gates([x, h])), q = tanh(candidate([x, r h])) -> h' = h + z (q - h).
 
-    Gradients in reverse mode only: what they need of it is kept under the name `CONVOLVED`.
+    Gradients in reverse mode only. Residuals are named `CONVOLVED` (for jax.checkpoint).
     """
     return _gru(native.is_wanted(), h, x, gates, candidate)
 
 
 def residual(x: jax.Array, first: Parameters, second: Parameters) -> jax.Array:
-    """relu(x + second(relu(first(x)))), likewise."""
+    """relu(x + second(relu(first(x)))); gradients as for `gru`."""
     return _residual(native.is_wanted(), x, first, second)
 
 
@@ -43,7 +43,7 @@ def _kept(maps):
 
 
 def _slope(y):
-    """Of the sigmoid, where its result is y."""
+    """The derivative of the sigmoid where its value is y."""
     return y * (1 - y)
 
 
@@ -110,7 +110,7 @@ def _gru_backward(machine_code, kept, by_state):
         return by_x + more_x, by_h + more_h
 
     change = by_state * update * (1 - q * q)
-    left = reset * h  # quicker than to keep it
+    left = reset * h  # recomputing is faster than storing it
     by_candidate = parameter_gradients(machine_code, (x, left), candidate, (change,))
     by_x, by_reset, by_update, by_h = choose(
         machine_code,

@@ -3,8 +3,7 @@
 A .npz holds the parameters under flat names ("gru1/gates/kernel", float32, kernels
 (rows, columns, in, out)), `normalise` (bool: the network expects normalised tensors) and
 `format` (int). It is read without pickle, and every name, shape, dtype and value is checked, so
-that what loads also runs. Whatever cannot be loaded raises CheckpointError, one sentence naming
-the file.
+whatever loads also runs. Anything else raises CheckpointError, which names the file.
 """
 
 import contextlib
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
 
 from firenet_jax.errors import CheckpointError
 from firenet_jax.events import BINS
@@ -24,7 +24,7 @@ from firenet_jax.storage.files import check_readable
 from firenet_jax.storage.pytorch_file import identify, read_state_dict, refuse_unused, take
 
 FORMAT = 1
-MAX_BYTES = 2**20  # six times a whole file: what claims more is no FireNet and is not read
+MAX_BYTES = 2**20  # six times a FireNet's: a larger file is something else and is not read
 PYTORCH = (".pth", ".pt", ".tar", ".ckpt")
 BUILT_IN = "built-in"
 TRY = "pass a .npz written by this program or a FireNet or FireNet+ checkpoint of PyTorch (.pth)"
@@ -52,10 +52,10 @@ for _layer, (_size, _inputs, _outputs) in LAYERS.items():
 
 
 def save_weights(path: str | Path, weights: Weights) -> None:
-    """Writes beside the final name and renames: a file with that name is always whole.
+    """Writes a temporary file and renames it, so the file is always complete.
 
-    Raises CheckpointError where the name is no .npz, the arrays are not FireNet's or not finite, or
-    the file cannot be written.
+    Raises CheckpointError if the name does not end in .npz, if the arrays are not FireNet's or not
+    finite, or if the file cannot be written.
     """
     path = Path(path)
     if path.suffix != ".npz":
@@ -74,13 +74,13 @@ def save_weights(path: str | Path, weights: Weights) -> None:
         ) from error
     finally:
         with contextlib.suppress(OSError):
-            part.unlink()  # still there only where writing failed
+            part.unlink()  # exists only if writing failed
 
 
 def load_weights(path: str | Path | None = None) -> Weights:
     """Weights from a .npz, a PyTorch checkpoint or the folder of a training run.
 
-    None or "built-in": the weights that come with the package.
+    None or "built-in": the weights in the package.
     Raises CheckpointError for a file that is missing, damaged or of another network.
     """
     if path is None or str(path) == BUILT_IN:
@@ -99,7 +99,7 @@ def load_weights(path: str | Path | None = None) -> Weights:
 
 
 def _load_default() -> Weights:
-    """Those that come with the package; docs/model_card.md says how they were made."""
+    """The weights in the package; docs/model_card.md says how they were trained."""
     file = importlib.resources.files("firenet_jax") / "weights" / "firenet.npz"
     with importlib.resources.as_file(file) as path:
         return _load_npz(path)
@@ -107,7 +107,7 @@ def _load_default() -> Weights:
 
 def _load_npz(path: Path) -> Weights:
     try:
-        # Damaged and hostile files claim any size: look at the archive before reading it.
+        # A damaged or hostile file may claim any size: check the archive before reading it.
         with zipfile.ZipFile(path) as archive:
             size = sum(info.file_size for info in archive.infolist())
         if size > MAX_BYTES:
@@ -118,8 +118,8 @@ def _load_npz(path: Path) -> Weights:
             raise ValueError("a member is not an array")
     except CheckpointError:
         raise
-    except Exception as error:  # damaged bytes reach every kind: Value, Key, BadZip, zlib, Memory
-        reason = " ".join(str(error).split())[:100]  # numpy's span lines
+    except Exception as error:  # damage raises many kinds: Value, Key, BadZip, zlib, Memory
+        reason = " ".join(str(error).split())[:100]  # numpy's messages span lines
         raise CheckpointError(
             f"{path} is not a whole .npz of weights ({type(error).__name__}: {reason}); {TRY}"
         ) from error
@@ -135,11 +135,11 @@ def _load_npz(path: Path) -> Weights:
     if normalise is None or normalise.shape != () or normalise.dtype != bool:
         raise CheckpointError(f"{path} does not say whether tensors are normalised; {TRY}")
     _check(path, flat, "holds no FireNet")
-    return Weights(params=_unflatten(flat), normalise=bool(normalise))
+    return Weights(params=unflatten_dict(flat, sep="/"), normalise=bool(normalise))
 
 
 def _check(path: Path, flat: dict[str, np.ndarray], problem: str) -> None:
-    """Every name, shape, dtype and value."""
+    """Raises CheckpointError unless every name, shape, dtype and value is right."""
     for name, shape in SHAPES.items():
         if name not in flat:
             raise CheckpointError(f"{path} {problem}: {name} is missing; {TRY}")
@@ -159,26 +159,9 @@ def _check(path: Path, flat: dict[str, np.ndarray], problem: str) -> None:
             raise CheckpointError(f"{path} {problem}: it has no place for {name!a}; {TRY}")
 
 
-def _flatten(tree, prefix: str = "") -> dict[str, np.ndarray]:
+def _flatten(tree) -> dict[str, np.ndarray]:
     """{"gru1": {"gates": {"bias": b}}} -> {"gru1/gates/bias": b}"""
-    flat = {}
-    for name, value in tree.items():
-        if hasattr(value, "items"):
-            flat |= _flatten(value, f"{prefix}{name}/")
-        else:
-            flat[prefix + name] = np.asarray(value)
-    return flat
-
-
-def _unflatten(flat: dict[str, np.ndarray]) -> dict:
-    tree: dict = {}
-    for name, value in flat.items():
-        *groups, leaf = name.split("/")
-        place = tree
-        for group in groups:
-            place = place.setdefault(group, {})
-        place[leaf] = value
-    return tree
+    return {name: np.asarray(value) for name, value in flatten_dict(tree, sep="/").items()}
 
 
 # ---- PyTorch
@@ -198,7 +181,7 @@ FAMILIES = {
             "head": "head.conv.conv2d",
             "gru1": "head.recurrent_block",
             "res1": "resblocks.0.conv",
-            "gru2": "resblocks.0.recurrent_block",  # the block convolves before its GRU
+            "gru2": "resblocks.0.recurrent_block",  # its GRU comes after its convolutions
             "res2": "resblocks.1",
             "prediction": "pred.conv2d",
         },
@@ -244,13 +227,13 @@ def convert(path: str | Path) -> Weights:
         flat[f"{layer}/bias"] = np.concatenate(biases)
 
     refuse_unused(tensors, prefix, path, "FireNet", TRY)
-    return Weights(params=_unflatten(flat), normalise=names.normalise)
+    return Weights(params=unflatten_dict(flat, sep="/"), normalise=names.normalise)
 
 
 def original_names(weights: Weights) -> tuple[str, dict[str, np.ndarray]]:
     """Weights -> (FireNet or FireNet+, the state dict that `convert` reads): HWIO -> OIHW.
 
-    Raises CheckpointError where the arrays are not FireNet's or not finite.
+    Raises CheckpointError if the arrays are not FireNet's or not finite.
     """
     flat = _flatten(weights.params)
     _check(Path("these weights"), flat, "cannot be written")

@@ -1,7 +1,7 @@
-"""Command line -> one command: firenet demo | reconstruct | live | train | evaluate and others.
+"""Command line -> one command: firenet demo | reconstruct | live | train | evaluate | ...
 
-A command is a frozen dataclass of settings and a `run(settings)` beside it, in a module that is
-imported only when the command is named: `firenet --help` loads no jax.
+A command is a module with a frozen dataclass of settings and a function `run(settings)`. It is
+imported only when the command is called, so `firenet --help` does not load jax.
 """
 
 import contextlib
@@ -26,18 +26,18 @@ COMMANDS = {
         "Reconstruct",
         "recordings -> video or pictures",
     ),
-    "live": ("firenet_jax.commands.live", "Live", "a camera, a stream -> pictures at once"),
+    "live": ("firenet_jax.commands.live", "Live", "a camera or a stream -> live pictures"),
     "info": ("firenet_jax.commands.info", "Info", "what a recording holds"),
     "simulate": (
         "firenet_jax.commands.simulate",
         "Simulate",
-        "training data, or a video file -> events",
+        "random scenes or a video file -> events",
     ),
-    "train": ("firenet_jax.commands.train", "Train", "simulated sequences -> weights"),
+    "train": ("firenet_jax.commands.train", "Train", "sequences or recordings -> weights"),
     "evaluate": (
         "firenet_jax.commands.evaluate",
         "Evaluate",
-        "methods beside camera frames -> report",
+        "recordings with frames -> a comparison of methods",
     ),
     "convert": ("firenet_jax.commands.convert", "Convert", "PyTorch checkpoint -> weights.npz"),
     "export": (
@@ -47,7 +47,7 @@ COMMANDS = {
     ),
 }
 
-# What only some commands need: the library, and the extra of this package that brings it.
+# Libraries that only some commands need -> the extra of this package that installs them.
 EXTRAS = {
     "optax": "train",
     "orbax": "train",
@@ -56,7 +56,7 @@ EXTRAS = {
     "skimage": "evaluate",
 }
 
-# Options of the original program (rpg_e2vid) and what does the same here.
+# Options of the original program (rpg_e2vid) -> the equivalent here.
 FORMER = {
     "-i": "name the recording without an option",
     "--input_file": "name the recording without an option",
@@ -79,56 +79,44 @@ def usage() -> str:
     lines = [f"  firenet {name:13} {summary}" for name, (_, _, summary) in COMMANDS.items()]
     return "\n".join(
         [
-            "firenet_jax: recordings of event cameras become video (FireNet in JAX)",
+            "firenet_jax: event camera recordings become video (FireNet in JAX)",
             "",
             *lines,
             "",
-            "firenet COMMAND --help explains a command, with examples. FIRENET_DEBUG=1 in the",
-            "environment shows where an error came from.",
+            "firenet COMMAND --help explains a command and gives examples. With FIRENET_DEBUG=1",
+            "in the environment, errors show a traceback.",
         ]
     )
 
 
-def _return_freed_memory() -> None:
-    """Has glibc give large freed blocks back at once.
-
-    By default it comes to keep blocks of up to 32 MB in a heap for each thread; those heaps
-    fragment, and a long reconstruction grows by a third of its memory before it settles.
-    """
-    if sys.platform == "linux":
-        with contextlib.suppress(OSError, AttributeError):  # another C library
-            ctypes.CDLL(None).mallopt(-3, 1 << 22)  # M_MMAP_THRESHOLD
-
-
+# Settings of glibc's malloc (number, value). By default it starts to keep freed blocks of up to
+# 32 MB in one heap per thread. These heaps fragment, and a long reconstruction grows by a third.
+RETURN_FREED_MEMORY = ((-3, 1 << 22),)  # M_MMAP_THRESHOLD
+# A training step allocates the same again: requesting it from the system takes a fifth of its time.
+KEEP_FREED_MEMORY = (  # no heaps of threads (M_ARENA_MAX), M_MMAP_MAX, M_TRIM_THRESHOLD
+    (-8, 1), (-4, 0), (-1, 2**31 - 1),
+)  # fmt: skip
+HUGE_PAGES = "glibc.malloc.hugetlb=1"
 REPORT = (
     "firenet: this is a fault of firenet, not of yours: please report it, with the command and all "
     "these lines"
 )
 
 
-def _keep_freed_memory() -> None:
-    """Tells glibc to keep memory for the same again, as a training step asks for it.
-
-    Else each step gets some hundred MB anew from the system, which takes a fifth of its time.
-    """
+def _set_malloc(choices: tuple[tuple[int, int], ...]) -> None:
     if sys.platform == "linux":
-        with contextlib.suppress(OSError, AttributeError):
-            tell = ctypes.CDLL(None).mallopt
-            tell(-8, 1)  # M_ARENA_MAX: those of threads keep no large blocks
-            tell(-4, 0)  # M_MMAP_MAX
-            tell(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
-
-
-HUGE_PAGES = "glibc.malloc.hugetlb=1"
+        with contextlib.suppress(OSError, AttributeError):  # another C library
+            for choice in choices:
+                ctypes.CDLL(None).mallopt(*choice)
 
 
 def program() -> int:
-    """What `firenet` runs: `main`, after glibc was told to take large blocks in huge pages.
+    """The entry point of `firenet`: `main`, with glibc set to use huge pages for large blocks.
 
-    XLA asks for its memory anew at each call. In pages of 4 kB that is some ten thousand page
-    faults a window at 640x480: a twelfth of the time of a reconstruction, a seventh of a training
-    step's. glibc takes the choice from the environment of a starting program, so this one starts
-    again, once.
+    XLA allocates its memory anew at each call. With pages of 4 kB that is some ten thousand page
+    faults per window at 640x480: a twelfth of the time of a reconstruction, a seventh of a training
+    step. glibc reads this setting from the environment at the start of a program, so this one
+    starts itself again, once.
     """
     if sys.platform == "linux" and "GLIBC_TUNABLES" not in os.environ:
         os.environ["GLIBC_TUNABLES"] = HUGE_PAGES
@@ -137,10 +125,10 @@ def program() -> int:
 
 
 def sentence(error: Exception, command: str) -> str | None:
-    """What a person is told who can put it right; None where the fault is this package's."""
+    """The message for an error that the user can fix; None for a bug in this package."""
     if isinstance(error, ModuleNotFoundError):
         library = (error.name or "").partition(".")[0]
-        if library in EXTRAS:  # several extras bring some: a command's own has its name
+        if library in EXTRAS:  # a library may be in several extras: prefer the command's own
             extra = command if command in EXTRAS.values() else EXTRAS[library]
             return (
                 f"firenet {command} needs {library}, which is not installed: "
@@ -158,8 +146,8 @@ def sentence(error: Exception, command: str) -> str | None:
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command; returns the exit code.
 
-    What a user can put right (`FirenetError`), the system's refusals (OSError) and a lack of memory
-    are one sentence. Anything else is a fault of this package and shows its traceback.
+    A `FirenetError`, an OSError or a lack of memory prints one sentence. Any other exception is a
+    bug in this package and shows its traceback.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments or arguments[0] in ("-h", "--help"):
@@ -178,7 +166,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     logging.basicConfig(format="firenet: %(message)s", level=logging.WARNING)
     name, rest = arguments[0], arguments[1:]
-    _keep_freed_memory() if name == "train" else _return_freed_memory()
+    _set_malloc(KEEP_FREED_MEMORY if name == "train" else RETURN_FREED_MEMORY)
     module, settings, _ = COMMANDS[name]
     for option in (word.partition("=")[0] for word in rest):
         if name == "reconstruct" and option in FORMER:

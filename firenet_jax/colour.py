@@ -1,13 +1,13 @@
-"""Grey pictures and those of a colour mosaic's channels -> pictures in colour.
+"""Grey pictures and those of a colour filter array's channels -> colour pictures.
 
-Every second pixel of every second row of a colour sensor (Color-DAVIS346) sees red, and so on:
+A colour sensor (Color-DAVIS346) has a filter array that repeats every two rows and columns:
 
-    R G        red [0::2, 0::2], green [0::2, 1::2], blue [1::2, 1::2]; what is at [1::2, 0::2],
-    . B        white or green, is not used
+    R G        red [0::2, 0::2], green [0::2, 1::2], blue [1::2, 1::2]; the pixels at
+    . B        [1::2, 0::2], white or green, are not used
 
-Each channel is reconstructed as a recording of its own, of half the size. Their colours are then
-laid over the grey picture of all pixels, which is twice as sharp: its lightness, their a* and b* in
-CIELAB (as in rpg_e2vid; Scheerlinck et al., "CED: Color Event Camera Dataset", CVPRW 2019).
+Each channel is reconstructed as a recording of its own, at half the size. Lightness is taken from
+the grey picture of all pixels, which is twice as sharp, and a* and b* of CIELAB from the channels
+(as in rpg_e2vid; Scheerlinck et al., "CED: Color Event Camera Dataset", CVPRW 2019).
 """
 
 import jax
@@ -16,7 +16,7 @@ import numpy as np
 
 from firenet_jax.errors import SettingsError
 
-CORNERS = ((0, 0), (0, 1), (1, 1))  # of red, green and blue: row, column
+CORNERS = ((0, 0), (0, 1), (1, 1))  # row and column of red, green and blue
 
 # Linear sRGB -> CIE XYZ (IEC 61966-2-1), and XYZ of its white (D65).
 XYZ = np.array(
@@ -26,16 +26,16 @@ WHITE = XYZ.sum(1)
 
 
 def check_sides(height: int, width: int) -> None:
-    """Raises SettingsError unless both sides hold the mosaic a whole number of times."""
+    """Raises SettingsError unless both sides are multiples of the filter array's."""
     if height % 2 or width % 2:
         raise SettingsError(
-            f"{width}x{height} cannot be a colour sensor, whose mosaic has even sides: leave out "
-            "--color, or give the --sensor-size"
+            f"{width}x{height} cannot be a colour sensor, whose sides are even: leave out --color, "
+            "or pass the right --sensor-size"
         )
 
 
 def channels(tensors: jax.Array) -> jax.Array:
-    """Event tensors (..., H, W, 5) of even sides -> (..., 3, H/2, W/2, 5), of red, green, blue."""
+    """Event tensors (..., H, W, 5), even sides -> (..., 3, H/2, W/2, 5): red, green and blue."""
     each = [tensors[..., row::2, column::2, :] for row, column in CORNERS]
     return jnp.stack(each, -4)
 
@@ -52,10 +52,8 @@ def coloured(greys: jax.Array, shades: jax.Array) -> jax.Array:
 
 
 def _full_size(values: jax.Array, first: int, axis: int) -> jax.Array:
-    """Samples at first, first + 2, ... -> all places, between two samples their mean.
-
-    Beyond the last sample its value goes on.
-    """
+    """Samples at first, first + 2, ... -> all positions, linearly interpolated; the first and the
+    last sample are repeated beyond the ends."""
     values = jnp.moveaxis(values, axis, -1)
     outer = jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(first, 1 - first)], mode="edge")
     between = (outer[..., 1:] + outer[..., :-1]) / 2
@@ -75,7 +73,7 @@ def to_lab(rgb: jax.Array) -> jax.Array:
 
 
 def to_rgb(lab: jax.Array) -> jax.Array:
-    """CIELAB (..., 3) -> sRGB (..., 3), outside [0, 1] where no screen shows such a colour."""
+    """CIELAB (..., 3) -> sRGB (..., 3), outside [0, 1] for colours outside of its gamut."""
     lightness, a, b = jnp.moveaxis(lab, -1, 0)
     y = (lightness + 16) / 116
     roots = jnp.stack([y + a / 500, y, y - b / 200], -1)

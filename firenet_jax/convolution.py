@@ -1,10 +1,10 @@
-"""Maps, kernel, bias -> maps: the layer of all networks here, quick on a CPU too; its gradient.
+"""Maps, kernel, bias -> maps: the convolutional layer of all networks here, and its gradient.
 
 Images are (B, H, W, channels), kernels (rows, columns, inputs, outputs), odd sizes, zero padding,
-no striding. On accelerators all is XLA's. On a CPU, 3x3 convolutions and their gradients are
-machine code of our own (`native`), where there is some. Where there is none, they are XLA's too,
-with few channels in another form, but for the gradient with respect to the kernel: inside a scan,
-XLA computes it in a way that takes many times as long as the matrix products below.
+no striding. On accelerators XLA computes everything. On a CPU, 3x3 convolutions and their gradients
+are machine code of our own (`native`), if available. Otherwise XLA computes them too, rearranged
+where there are few channels, except for the gradient with respect to the kernel: inside a scan,
+XLA's own takes many times as long as the matrix products below.
 """
 
 from collections.abc import Sequence
@@ -26,20 +26,20 @@ def _plain(image: jax.Array, kernel: jax.Array) -> jax.Array:
 
 def _convolve(image: jax.Array, kernel: jax.Array) -> jax.Array:
     _, columns, inputs, outputs = kernel.shape
-    known = isinstance(image.shape[2], int)  # not in what is exported for any width
+    known = isinstance(image.shape[2], int)  # an exported program has a symbolic width
     if columns == 1 or inputs * outputs > 16 * 16 or not known:
         return _plain(image, kernel)
-    # Quickest on a CPU: 2 of 2, 3, 4 with 16 inputs; 4 with the event tensor's 5.
+    # Fastest on a CPU: 2 (of 2, 3, 4) with 16 inputs; 4 with the event tensor's 5.
     beside = partial(side_by_side, pixels=2 if inputs >= 16 else 4)
     return jax.lax.platform_dependent(image, kernel, cpu=beside, default=_plain)
 
 
 def side_by_side(image: jax.Array, kernel: jax.Array, pixels: int) -> jax.Array:
-    """The same convolution, of so many pixels of a row at once: one pixel of as many channels.
+    """The same convolution with `pixels` neighbours of a row as channels of one pixel.
 
-    With few channels, most of the time on a CPU goes into what XLA does for each pixel besides the
-    products. Two pixels share most of what they depend on: 4 columns for both instead of 3 for
-    each. That is 1.33 times the products (3 columns), a quarter of them with zeros.
+    With few channels, XLA on a CPU spends most of the time on its overhead per pixel. Two
+    neighbours share most of their inputs: 4 columns for both instead of 3 for each. With 3 columns
+    that is 1.33 times the products, a quarter of them with zeros.
     """
     rows, columns, inputs, outputs = kernel.shape
     batch, height, width, _ = image.shape
@@ -67,17 +67,17 @@ def layer(
     bias: jax.Array | None = None,
     activations: tuple[str, ...] = ("none",),
 ) -> tuple[jax.Array, ...]:
-    """Maps of as many channels each, convolved as one -> activation(. + bias), one map a name.
+    """Maps with equal channels, concatenated and convolved -> activation(. + bias), one map each.
 
-    (B, H, W, I / maps), (rows, columns, I, O), (O,) -> (B, H, W, O / names); activations by the
-    names of `ACTIVATIONS`. For gradients, in reverse mode only, the results are kept, under the
-    name `CONVOLVED` (jax.checkpoint).
+    (B, H, W, I / maps), (rows, columns, I, O), (O,) -> (B, H, W, O / activations); activations are
+    keys of `ACTIVATIONS`. Gradients in reverse mode only; the results are their residuals, named
+    `CONVOLVED` (for jax.checkpoint).
     """
     bias = jnp.zeros(kernel.shape[3], kernel.dtype) if bias is None else bias
     return _layer(native.is_wanted(), activations, tuple(maps), kernel, bias)
 
 
-# An activation, and its derivative as a function of its result.
+# An activation, and its derivative as a function of its value.
 ACTIVATIONS = {
     "none": (lambda x: x, jnp.ones_like),
     "relu": (jax.nn.relu, lambda y: (y > 0).astype(y.dtype)),
@@ -110,7 +110,7 @@ def _joined(maps):
 
 
 def choose(machine_code: bool, *functions_and_arguments) -> Any:
-    """As `native.choose`, but the second function where machine code is not wanted."""
+    """As `native.choose`, but the second function if machine code is not wanted."""
     if machine_code:
         return native.choose(*functions_and_arguments)
     _, otherwise, *arguments = functions_and_arguments
@@ -118,7 +118,7 @@ def choose(machine_code: bool, *functions_and_arguments) -> Any:
 
 
 def turned(kernel: jax.Array) -> jax.Array:
-    """The kernel that takes gradients of results to gradients of maps."""
+    """The kernel that maps gradients of the results to gradients of the maps."""
     return kernel[::-1, ::-1].swapaxes(2, 3)
 
 
@@ -148,7 +148,7 @@ def _backward(machine_code, activations, kept, gradients):
 
 
 def parameter_gradients(machine_code: bool, maps, kernel, gradients) -> tuple[jax.Array, jax.Array]:
-    """Those of kernel and bias, from those of a layer's sums."""
+    """Gradients of kernel and bias, from those of the layer's pre-activations."""
 
     def by_xla(maps, kernel, gradients):
         by = partial(jax.lax.platform_dependent, cpu=kernel_gradient, default=_xla_kernel_gradient)
@@ -173,9 +173,9 @@ def _xla_kernel_gradient(image, kernel, gradient):
 def kernel_gradient(image: jax.Array, kernel: jax.Array, gradient: jax.Array) -> jax.Array:
     """dK[i, j] = sum over all pixels of image[y + i - r, x + j - c] gradient[y, x]^T.
 
-    A matrix product for each row i of the kernel: the image shifted by i rows, times the
-    gradient shifted against the columns j of the kernel, these side by side as channels. Both as
-    (pixels, channels): summed over three axes instead of one, products take XLA four times as long.
+    A matrix product for each row i of the kernel: the image shifted by i rows, times the gradient
+    shifted for each column j of the kernel, concatenated as channels. Both are (pixels, channels):
+    contracting three axes instead of one takes XLA four times as long.
     """
     rows, columns, inputs, outputs = kernel.shape
     height, width = image.shape[1:3]

@@ -1,10 +1,10 @@
-"""Trees of arrays -> the same arrays dealt out to devices: some of a batch's sequences to each.
+"""Trees of arrays -> the same arrays sharded over devices along the batch axis.
 
-Sequences have nothing to do with each other, so this is all there is to many devices: the batch
-axis of everything is split, the parameters are on all of them.
+Sequences are independent, so data parallelism is all that is needed: the batch axis of every array
+is sharded, the parameters are replicated.
 
-Which of several processes this is, and of how many, is what the settings say, else what a launcher
-says in the environment of each process that it starts.
+The index and number of processes come from the settings, otherwise from environment variables that
+a launcher sets.
 """
 
 import os
@@ -22,9 +22,9 @@ BATCH = P("devices")  # the first axis of a state
 TIME_BATCH = P(None, "devices")  # the second one of what comes in windows
 
 
-# Launchers: the names under which they say which process this is, and how many there are. mpirun
-# within a Slurm job leaves Slurm's names too, which are those of the nodes' daemons. Kubernetes
-# tells the pods of an indexed job no number of them.
+# The environment variables in which launchers state the index and the number of processes. Open MPI
+# comes first: under mpirun in a Slurm job, Slurm's variables describe the nodes' daemons.
+# Kubernetes does not state the number of pods of an indexed job.
 LAUNCHERS = (
     ("OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE"),  # Open MPI
     ("SLURM_PROCID", "SLURM_STEP_NUM_TASKS"),  # srun; a batch script itself is no task of a step
@@ -33,17 +33,17 @@ LAUNCHERS = (
 
 
 def share(process: int | None, processes: int | None) -> tuple[int, int]:
-    """(which process this is, from 0, of how many): as given, else as a launcher has it, else the
-    only one. The number alone may be given where a launcher says which one this is.
+    """(index of this process, from 0, number of processes): as given, else from a launcher, else
+    (0, 1). The number alone may be given if a launcher states the index.
 
-    Raises SettingsError where these do not fit together."""
+    Raises SettingsError if they contradict each other."""
     asked = processes
     if process is None:
         process, processes = _launched(processes)
     if process is None or processes is None:
         if asked is not None or process is not None:
             raise SettingsError(
-                "several processes need both of --processes and --process, where no launcher says "
+                "several processes need both of --processes and --process, unless a launcher sets "
                 "them (Slurm's srun, Open MPI, an indexed Kubernetes job)"
             )
         return 0, 1
@@ -55,8 +55,8 @@ def share(process: int | None, processes: int | None) -> tuple[int, int]:
 
 
 def _launched(processes: int | None) -> tuple[int | None, int | None]:
-    """(which, of how many), as the environment says; of a launcher that tells no number, with the
-    one given, and nothing where none is."""
+    """(index, number) from the environment. Where the launcher does not state the number, the given
+    one; without that, (None, None)."""
     for which, number in LAUNCHERS:
         if which in os.environ and (number is None or number in os.environ):
             texts = [os.environ[name] for name in (which, number) if name is not None]
@@ -72,14 +72,13 @@ def _launched(processes: int | None) -> tuple[int | None, int | None]:
 
 
 def join(coordinator: str | None, processes: int | None, process: int | None) -> None:
-    """Becomes one of several processes, on this machine or on many: of those given, else of those
-    that srun or Open MPI has started; else nothing happens. Raises SettingsError where JAX does not
-    find the others."""
+    """Joins the processes given by the settings, else those that srun or Open MPI has started, else
+    does nothing. Raises SettingsError if JAX does not find the other processes."""
     if coordinator is not None:
         process, processes = share(process, processes)
     elif share(None, None)[1] == 1:
         return
-    # Else SIGTERM would only be noted down, for programs that ask for it, and ended by nothing.
+    # JAX's preemption service would catch SIGTERM, so that the process would not end.
     jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(coordinator, processes, process)
@@ -91,13 +90,13 @@ def join(coordinator: str | None, processes: int | None, process: int | None) ->
 
 
 def is_first() -> bool:
-    """Whether this is the process that writes and talks."""
+    """Whether this is the process that writes files and messages."""
     return jax.process_index() == 0
 
 
 def check_processes(coordinator: str | None, processes: int | None, process: int | None) -> None:
-    """Raises SettingsError unless all of the three are given, or none, or a coordinator alone where
-    a launcher says the rest."""
+    """Raises SettingsError unless all three are given, or none, or a coordinator alone and a
+    launcher states the rest."""
     if coordinator is not None:
         share(process, processes)
     elif (processes, process) != (None, None):
@@ -105,23 +104,23 @@ def check_processes(coordinator: str | None, processes: int | None, process: int
 
 
 def device_mesh(devices: Sequence | None = None) -> Mesh:
-    """These devices, by default all of all processes."""
+    """A mesh of these devices; by default all devices of all processes."""
     devices = jax.devices() if devices is None else devices
     return jax.make_mesh((len(devices),), ("devices",), (AxisType.Auto,), devices=devices)
 
 
 def sharding(spec: P = REPLICATED, mesh: Mesh | None = None) -> NamedSharding:
-    """How an array lies on the devices: whole on each of them, or split along its batch."""
+    """The sharding of an array: replicated, or split along its batch axis."""
     return NamedSharding(device_mesh() if mesh is None else mesh, spec)
 
 
 def replicated(tree):
-    """Arrays of the host -> the same on all devices of all processes."""
+    """Arrays on the host -> replicated on all devices of all processes."""
     return jax.device_put(jax.tree.map(np.asarray, tree), sharding())
 
 
 def on_each_device(function, in_specs, out_specs, mesh: Mesh | None = None):
-    """A function of each device's part of the batch -> one of the whole batch."""
+    """A function of one device's shard of the batch -> a function of the whole batch."""
     mesh = device_mesh() if mesh is None else mesh
     return jax.shard_map(
         function, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False

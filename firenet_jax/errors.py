@@ -1,9 +1,8 @@
-"""What goes wrong -> one sentence that says what and where, and what to do about it.
+"""A user's mistake -> one sentence: what is wrong, where, and what to do about it.
 
-A `FirenetError` is for the person who runs the program: the command line prints its sentence. They
-are ValueErrors, for those who call the package from Python. Any other exception, OSError and
-MemoryError apart, is a fault of this package. What is worth knowing but stops nothing goes to
-`logger`.
+A `FirenetError` is for the person who runs the program: the command line prints its message. It is
+a ValueError too, for callers from Python. Any other exception, except OSError and MemoryError, is a
+bug in this package. Warnings and notices go to `logger`.
 """
 
 import logging
@@ -12,24 +11,26 @@ logger = logging.getLogger("firenet_jax")
 
 
 class FirenetError(ValueError):
-    """What a person can put right; the message is one sentence."""
+    """An error that the user can fix. The message is one sentence."""
 
 
 class SettingsError(FirenetError):
-    """Settings cannot be, or do not fit each other or the data: which, and what they can be."""
+    """A setting is invalid, or does not fit the other settings or the data."""
 
 
 class RecordingError(FirenetError):
-    """A recording cannot be used; the message is one sentence: file, place, found, what to do."""
+    """A recording cannot be used. The message names the file, the place, what was found there and
+    what to do."""
 
 
 class CheckpointError(FirenetError):
-    """Weights cannot be used; the message is one sentence: file, what is wrong, what to do."""
+    """Weights cannot be used. The message names the file, the problem and what to do."""
 
 
 class PictureError(FirenetError):
-    """Pictures or a video file cannot be used: file, what is wrong, what to do."""
+    """A picture or a video file cannot be used. The message names the file, the problem and what to
+    do."""
 
 
 class OutputError(FirenetError):
-    """A file cannot be written as asked; the message is one sentence."""
+    """An output cannot be written as requested."""

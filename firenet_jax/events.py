@@ -1,4 +1,4 @@
-"""Columns -> Events: what an event is, and the checks that every recording passes at the door.
+"""Columns -> Events: what an event is, and the checks that every recording must pass.
 
 An event (t, x, y, p) says that the pixel in column x and row y became brighter (p true, "ON") or
 darker (p false, "OFF") by one contrast threshold at time t. Times are int64 microseconds: float32
@@ -14,11 +14,9 @@ from typing import NamedTuple, overload
 import numpy as np
 
 from firenet_jax.errors import RecordingError
-from firenet_jax.settings import LONGEST_SIDE
 
-BINS = 5  # of an event tensor: what a window is split into along time (Eq. 1)
-LATEST = 2**53  # microseconds, 285 years: float64 seconds lose microseconds beyond
-REACH = LONGEST_SIDE
+BINS = 5  # temporal bins of an event tensor (Eq. 1)
+MAX_TIME = 2**53  # microseconds, 285 years: beyond it float64 loses microseconds
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -39,9 +37,9 @@ class Events:
 
     @classmethod
     def of(cls, t, x, y, p) -> "Events":
-        """Columns of whole numbers -> Events with the dtypes above; p: bool, 0 and 1, or -1 and 1.
-        Raises ValueError for columns of different lengths, and for times that are no whole
-        microseconds. What the numbers are is checked by `recording` and the readers."""
+        """Columns of integers -> Events with the dtypes above; p is bool, 0 and 1, or -1 and 1.
+        Raises ValueError if the columns differ in length or the times are not whole microseconds.
+        `recording` and the readers check the values themselves."""
         t, x, y, p = map(np.asarray, (t, x, y, p))
         if not t.shape == x.shape == y.shape == p.shape:
             raise ValueError(
@@ -63,11 +61,11 @@ class Events:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rows:
-    """N rows of a file, of which some are no events."""
+    """N rows of a file, some of which are not valid events."""
 
-    events: Events  # N; of the rows that are none, any numbers
-    bad: np.ndarray  # (N,) bool, which these are
-    error: RecordingError  # what is to be said of the first of them
+    events: Events  # N; arbitrary values in the bad rows
+    bad: np.ndarray  # (N,) bool, the rows that are not events
+    error: RecordingError  # the message for the first bad row
 
     def __len__(self) -> int:
         return len(self.events)
@@ -78,7 +76,7 @@ def concatenate(chunks: Sequence[Events]) -> Events: ...
 @overload
 def concatenate(chunks: Sequence[Events | Rows]) -> Events | Rows: ...
 def concatenate(chunks: Sequence[Events | Rows]) -> Events | Rows:
-    """Chunks -> one chunk; without copying when there is only one."""
+    """Chunks -> one chunk. A single chunk is returned without copying."""
     if len(chunks) == 1:
         return chunks[0]
     errors = [chunk.error for chunk in chunks if isinstance(chunk, Rows)]
@@ -91,11 +89,11 @@ def concatenate(chunks: Sequence[Events | Rows]) -> Events | Rows:
 
 
 class Frames(NamedTuple):
-    """The pictures that some cameras take beside the events."""
+    """The pictures that some cameras record alongside the events."""
 
     times: np.ndarray  # (F,) int64, microseconds, on the clock of the events
     read: Callable[[int], np.ndarray]  # i -> (H, W) uint8
-    # i -> (2, H, W), x then y, pixels per second up to this picture; None where a file has none
+    # i -> (2, H, W) optical flow up to this picture, x then y, pixels per second; None: no flow
     flow: Callable[[int], np.ndarray | None] | None = None
 
 
@@ -104,11 +102,11 @@ class Triggers(NamedTuple):
 
     times: np.ndarray  # (N,) int64, microseconds, on the clock of the events
     ids: np.ndarray  # (N,) int64, number of the input
-    polarity: np.ndarray  # (N,) bool, True: rising, or a file that does not tell the edges apart
+    polarity: np.ndarray  # (N,) bool, True: rising, or the file does not distinguish the edges
 
 
 def no_triggers() -> None:
-    """Of a recording that holds none."""
+    """The triggers of a recording that has none."""
 
 
 @dataclass(frozen=True)
@@ -116,15 +114,15 @@ class Recording:
     """A file or folder of events, opened but not read: memory does not grow with its length."""
 
     path: Path
-    format: str  # in words, for people: "ECD folder"
+    format: str  # for people: "ECD folder"
     height: int
     width: int
     events: Callable[[], Iterator[Events]]  # every call starts from the first event
-    count: int | None = None  # number of events, where the file says it
+    count: int | None = None  # number of events, if the file states it
     frames: Frames | None = None
-    inferred: bool = False  # whether the sensor's size is that of its events
-    grey: bool = False  # whether the file says that the sensor sees no colours
-    triggers: Callable[[], Triggers | None] = no_triggers  # reads the file; None: there are none
+    inferred: bool = False  # whether the sensor size was inferred from the events
+    grey: bool = False  # whether the file states that the sensor is monochrome
+    triggers: Callable[[], Triggers | None] = no_triggers  # reads the file; None: it has none
 
     @property
     def pixels(self) -> int:
@@ -145,11 +143,11 @@ def rate_in_words(rate: float) -> str:
 
 
 def event_number(row: int) -> str:
-    """The place of an event, counted from 1, in a file that has no lines."""
+    """Where an event is, counted from 1, in a file without lines."""
     return f"event {row + 1}"
 
 
-MOST_BAD = 1e-3  # of the rows may be left out: beyond, the fault is not that of single events
+MAX_BAD_SHARE = 1e-3  # of the rows; if more are bad, the whole file is suspect
 
 
 def checked(
@@ -161,15 +159,15 @@ def checked(
     strict: bool = True,
     say: Callable[[str, int], None] = lambda what, count: None,
 ) -> Iterator[Events]:
-    """Passes events on, without rows that cannot be events, up to where there are too many.
+    """Yields the valid events and drops bad rows, until there are too many of these.
 
-    Time must not run backwards, within a chunk or between two; x and y must not be negative, nor
-    reach the sensor's width and height where these are known. Of rows that break the order of time
-    as few are left out as can be. What is left out, and damage that ends the reading early, goes
-    to `say(sentence, count)` at the end. Raises RecordingError for the first bad row where more
-    than one in a thousand of those read so far are bad, and for damage before the first event;
-    strict: for any. `place(row)` names the row (counted from 0 over the whole recording) in the
-    words of the file: "line 7".
+    Time must not run backwards, within a chunk or between chunks. x and y must not be negative or
+    lie outside the sensor, if its size is known. Of rows out of order, as few as possible are
+    dropped. At the end, `say(sentence, count)` reports what was dropped, and damage that ended the
+    reading early. Raises RecordingError for the first bad row if more than one in a thousand rows
+    so far are bad, and for damage before the first event; with `strict`, for any bad row or damage.
+    `place(row)` names a row (counted from 0 over the whole recording) in the file's own terms, such
+    as "line 7".
     """
     rows, dropped, last, first_error = 0, 0, None, None
     try:
@@ -197,10 +195,10 @@ def checked(
             bad = bad | _outside(events, height, width)
             fewest = bad | _out_of_order(events.t, bad, last)
             count = int(fewest.sum())
-            if strict or dropped + count > MOST_BAD * (rows + len(events)):
-                if first:  # whoever stops before the damage never meets it
+            if strict or dropped + count > MAX_BAD_SHARE * (rows + len(events)):
+                if first:  # so that a caller who stops before the damage never meets it
                     yield events.select(slice(first))
-                dropped = 0  # the error says enough
+                dropped = 0  # the error already says it
                 raise error
             first_error = first_error or error
             rows, dropped = rows + len(events), dropped + count
@@ -234,10 +232,10 @@ def _outside(events: Events, height: int | None, width: int | None) -> np.ndarra
 
 
 def _out_of_order(t: np.ndarray, bad: np.ndarray, last: int) -> np.ndarray:
-    """(N,) times, which of them do not count -> the fewest to leave out so that the rest is in
-    order, none before `last`: all but a longest non-decreasing subsequence (patience sorting)."""
+    """(N,) times, without those in `bad` -> a smallest set to drop so that the rest is in order and
+    not before `last`: all but a longest non-decreasing subsequence (patience sorting)."""
     out = ~bad & (t < last)
-    rows = np.flatnonzero(~bad & ~out)[::-1]  # from the end: of two that would do, the first stays
+    rows = np.flatnonzero(~bad & ~out)[::-1]  # from the end: of two candidates the first stays
     times = (-t[rows]).tolist()
     if not times or bool((np.diff(t[rows]) <= 0).all()):
         return out
@@ -264,7 +262,7 @@ def _out_of_order(t: np.ndarray, bad: np.ndarray, last: int) -> np.ndarray:
 def _first_error(
     chunk: "Events | Rows", path: Path, last: int, height, width, place, rows: int
 ) -> tuple[int, RecordingError]:
-    """(the first row of a chunk that cannot be, what is to be said of it); rows: before it"""
+    """The first bad row of a chunk, and its error; rows: number of rows before the chunk."""
     events = chunk if isinstance(chunk, Events) else chunk.events
     known = chunk.bad if isinstance(chunk, Rows) else np.zeros(len(events), bool)
     t, x, y = events.t, events.x, events.y
@@ -291,7 +289,7 @@ def _first_error(
 
 
 def check_recording(recording) -> None:
-    """Raises TypeError for what is none, such as a path."""
+    """Raises TypeError for anything else, such as a path."""
     if not isinstance(recording, Recording):
         raise TypeError(
             f"the recording is a {type(recording).__name__}: pass what open_recording gives"
@@ -299,8 +297,8 @@ def check_recording(recording) -> None:
 
 
 def until_damage(chunks: Iterable[Events]) -> Iterator[Events]:
-    """Chunks up to damage, for a first look at a recording: whoever uses it will meet the error,
-    or stop before. Raises it where there is nothing before."""
+    """Chunks up to any damage, for a first look at a recording; reading the recording itself will
+    raise the error. Raises it here only if nothing comes before."""
     seen = 0
     try:
         for events in chunks:

@@ -1,6 +1,6 @@
-"""Event stream -> event stream: part of the time, without hot pixels, upside down.
+"""Event stream -> event stream: a part of the time, without hot pixels, or rotated.
 
-Each filter takes and gives an iterator of `Events` chunks and never holds more than one.
+Each filter maps an iterator of `Events` chunks to another and holds at most one chunk.
 """
 
 from collections.abc import Iterable, Iterator
@@ -11,14 +11,14 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from firenet_jax.errors import RecordingError, SettingsError
-from firenet_jax.events import LATEST, Events, Recording, until_damage
+from firenet_jax.events import MAX_TIME, Events, Recording, until_damage
 from firenet_jax.storage.files import check_readable
 
 
 def check_span(start: float | None, stop: float | None) -> None:
-    """Raises SettingsError unless these seconds, None for no bound, are a part of a recording."""
+    """Raises SettingsError unless these bounds in seconds, None for no bound, are valid."""
     for name, value in (("start", start), ("stop", stop)):
-        if value is not None and not abs(value) < LATEST / 1e6:
+        if value is not None and not abs(value) < MAX_TIME / 1e6:
             raise SettingsError(f"{name} is {value} s, but must be a time: leave it out for none")
     if start is not None and start < 0:
         raise SettingsError(f"start is {start} s, but counts from the beginning: 0 or more")
@@ -44,8 +44,8 @@ def between(chunks: Iterable[Events], start: float | None, stop: float | None) -
 def without(chunks: Iterable[Events], hot: np.ndarray) -> Iterator[Events]:
     """Drops the events of hot pixels; hot: (H, W) bool.
 
-    They are dropped before the cut, so that a window of N events holds N useful ones. (The
-    original program cuts first and blanks the pixels afterwards.)
+    They are dropped before the recording is cut into windows, so a window of N events holds N
+    useful ones. (The original program cuts first and blanks the pixels afterwards.)
     """
     for events in chunks:
         kept = events.select(~hot[events.y, events.x])
@@ -54,18 +54,18 @@ def without(chunks: Iterable[Events], hot: np.ndarray) -> Iterator[Events]:
 
 
 def turned(chunks: Iterable[Events], height: int, width: int) -> Iterator[Events]:
-    """Turns the picture by 180 degrees, for cameras that hang upside down."""
+    """Rotates the picture by 180 degrees, for cameras that are mounted upside down."""
     for events in chunks:
         yield replace(events, x=width - 1 - events.x, y=height - 1 - events.y)
 
 
 def find_hot_pixels(recording: Recording, most: int = 5_000_000) -> np.ndarray:
-    """Recording -> (H, W) bool: pixels that fire without a reason, found in the first events.
+    """Recording -> (H, W) bool: the hot pixels, found in the first events.
 
-    A hot pixel fires alone: at least 10 times as often as the median of its 5x5 neighbourhood,
-    and more often than any pixel would by chance (6 standard deviations above the mean of the
-    pixels that fire; at least 10 events). A moving edge fires its neighbours too.
-    most: how many events to look at.
+    A hot pixel fires alone: at least 10 times as often as the median of its 5x5 neighbourhood, and
+    more often than chance allows (6 standard deviations above the mean of all active pixels; at
+    least 10 events). A moving edge makes neighbouring pixels fire too.
+    most: number of events to read.
     """
     counts = np.zeros(recording.pixels, np.int64)
     seen = 0
@@ -79,7 +79,7 @@ def find_hot_pixels(recording: Recording, most: int = 5_000_000) -> np.ndarray:
 
 
 def hot_pixels_of(counts: np.ndarray) -> np.ndarray:
-    """(H, W) event counts -> (H, W) bool, as `find_hot_pixels` says."""
+    """(H, W) event counts -> (H, W) bool, by the rule of `find_hot_pixels`."""
     active = counts[counts > 0]
     if active.size == 0:
         return np.zeros(counts.shape, bool)
@@ -88,9 +88,9 @@ def hot_pixels_of(counts: np.ndarray) -> np.ndarray:
 
 
 def read_hot_pixels(path: str | Path, height: int, width: int) -> np.ndarray:
-    """A text file with one `x,y` a line -> (H, W) bool, the format of rpg_e2vid.
+    """A text file with one `x,y` per line -> (H, W) bool, the format of rpg_e2vid.
 
-    Raises RecordingError naming the line that is not one.
+    Raises RecordingError, which names the invalid line.
     """
     path = Path(path)
     hot = np.zeros((height, width), bool)

@@ -1,17 +1,18 @@
-"""(windows of a recording, times) -> steps: what the network takes in, and when it only looks.
+"""(windows of a recording, times) -> steps: which update the state, and which only give an image.
 
-Time and diet are two things. The state advances by windows of the density that the network likes:
-each is a step whose new state S[k] is kept. An image at any other time is a step whose new state
-is thrown away, of a window of about the same length that ends at that time:
+When an image is made and what updates the state are independent. The state advances by windows of
+the density that the network was trained on: each is a step whose new state S[k] is kept. An image
+at any other time is a look: a step whose new state is discarded, over a window of about the same
+length that ends at that time:
 
     kept windows        |------ W[k] ------|---- W[k+1] ----|
     an image at t                |---------------->t
 
-Where a share s of W[k+1] has passed at t, the image is of the last 1 - s of W[k] and what there is
-of W[k+1], seen from the state (1 - s) S[k-1] + s S[k], about the one where that window begins. For
-s = 0 this is the step that keeps W[k], for s = 1 the one that keeps W[k+1]: images change smoothly
-across the steps that are kept, and none depends on which others are asked for, nor on the future.
-(Of W[k+1]'s part alone, from S[k], images just after a kept window would be of hardly any events.)
+If a share s of W[k+1] has passed at t, the look takes the last 1 - s of W[k] and the part of W[k+1]
+so far, from the state (1 - s) S[k-1] + s S[k], roughly the state at the start of that window. For
+s = 0 this is the step that keeps W[k], for s = 1 the one that keeps W[k+1], so images change
+smoothly across kept steps. No image depends on which others are requested, or on the future. (A
+look at the part of W[k+1] alone, from S[k], would have hardly any events just after a kept window.)
 """
 
 import math
@@ -26,25 +27,25 @@ from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.events import Events, Recording, concatenate
 from firenet_jax.windows import Window, Windows, cut
 
-FASTEST = 1_000_000  # images per second: times are whole microseconds
+MAX_RATE = 1_000_000  # images per second: times are whole microseconds
 
 
 class Step(NamedTuple):
-    """What becomes one event tensor."""
+    """The input of one step of the network."""
 
     events: Events
-    time: int | None  # int64 us, of an image; None: the state is kept and no image wanted
-    share: float  # of the way from the state before the last one kept to that one
-    new: int = 0  # of an image's events, the last so many: those since the last step that was kept
+    time: int | None  # int64 us of a look's image; None: the new state is kept, without an image
+    share: float  # s: a step starts from (1 - s) S[k-1] + s S[k], the last two kept states
+    new: int = 0  # how many of a look's last events came after the last kept step
 
 
 @dataclass
 class Counts:
-    """What happened to the times that were asked for."""
+    """How many of the requested times have an image."""
 
     seen: int = 0
     early: int = 0  # before the first event
-    late: int = 0  # after the last one; of an endless grid 0
+    late: int = 0  # after the last event; 0 for an endless grid
 
 
 def steps(
@@ -54,12 +55,11 @@ def steps(
     chunks: Iterable[Events] | None = None,
     counts: Counts | None = None,
 ) -> Iterator[Step]:
-    """Recording, times -> the steps that give an image at each time, those kept among them.
+    """Recording, times -> the steps that give an image at each time, and the kept ones in between.
 
-    times: microseconds on the recording's clock, in order; may be without end. Times before the
-    first event and after the last one have no image. An image at t has seen the events up to t,
-    those at t among them.
-    chunks: the recording's events after filters; None: as they are. counts: is filled in.
+    times: microseconds on the recording's clock, in order; may be endless. Times before the first
+    event or after the last one get no image. An image at t has seen all events up to and at t.
+    chunks: the recording's events after filters; None: unfiltered. counts: filled in.
     Raises SettingsError for windows that overlap or lie between frames, and RecordingError as `cut`
     does, after the steps up to the damage.
     """
@@ -83,7 +83,7 @@ def steps(
 
 
 def _in_order(times: Iterable[int]) -> Iterator[int]:
-    """Raises SettingsError where they are not: what came before is gone."""
+    """Raises SettingsError if they are not in order: earlier events are no longer in memory."""
     last = None
     for time in times:
         if last is not None and time < last:
@@ -93,7 +93,7 @@ def _in_order(times: Iterable[int]) -> Iterator[int]:
 
 
 def check(windows: Windows) -> None:
-    """Raises SettingsError for windows whose states are of no use for images at given times."""
+    """Raises SettingsError for windows that cannot be combined with images at given times."""
     if windows.between_frames:
         raise SettingsError("images at given times come of windows of a size, not between frames")
     if windows.step is not None:
@@ -101,14 +101,14 @@ def check(windows: Windows) -> None:
 
 
 def _spans(windows: Windows, cutter: Iterator[Window]) -> Iterator[tuple[Window, int, int]]:
-    """Windows -> (window, the time where it begins, where it ends): each begins where the last
-    ended. The last window ends just after its last event."""
+    """Windows -> (window, its begin, its end): each begins where the last one ended. The last
+    window ends just after its last event."""
     first = None
     window, number, error = next(cutter, None), 0, None
     while window is not None:
         try:
             following = next(cutter, None)
-        except RecordingError as damage:  # told after what came before it
+        except RecordingError as damage:  # raised after the windows before it
             following, error = None, damage
         if windows.duration is not None:
             first = int(window.events.t[0]) if first is None else first
@@ -125,14 +125,14 @@ def _spans(windows: Windows, cutter: Iterator[Window]) -> Iterator[tuple[Window,
 
 
 def _span(windows: Windows) -> Fraction:
-    """Microseconds of windows in time."""
+    """Microseconds per window, for windows in time."""
     return Fraction(str(windows.duration)) * 1000
 
 
 def _look(
     recording: Recording, windows: Windows, before: Events, now: Events, begin: int, time: int
 ) -> Step:
-    """before, now: the events of the last window that is kept and of the next one."""
+    """before, now: the events of the last kept window and of the next one."""
     passed = now.select(slice(0, int(np.searchsorted(now.t, time, "right"))))
     if windows.duration is not None:
         share = (time - begin) / float(_span(windows))
@@ -147,10 +147,10 @@ def _look(
 
 
 class Grid:
-    """first + n / rate for n = number, number + 1 ... without end, rounded to microseconds.
+    """first + n / rate for n = number, number + 1, ..., endless, rounded to microseconds.
 
-    Each is computed from its number, so rounding never adds up, and grids of 30, 300 and 3,000
-    per second share the times of the coarsest."""
+    Each is computed from its number, so rounding never adds up: grids of 30, 300 and 3,000 per
+    second share the times of the coarsest."""
 
     def __init__(self, first: int, rate: float, number: int = 0):
         self.first, self.number = first, number
@@ -166,7 +166,7 @@ class Grid:
 
 
 def grid(first: int, rate: float, from_zero: bool = False) -> Grid:
-    """Times so many per second from the first event on; from_zero: of a grid through time 0."""
+    """`rate` times per second, from `first` on; from_zero: on the grid through time 0."""
     check_rate(rate)
     if not from_zero:
         return Grid(first, rate)
@@ -174,6 +174,6 @@ def grid(first: int, rate: float, from_zero: bool = False) -> Grid:
 
 
 def check_rate(rate: float) -> None:
-    """Raises SettingsError for a rate that is not above 0, or more than one a microsecond."""
-    if not 0 < rate <= FASTEST:
-        raise SettingsError(f"rate is {rate:g}, but must be more than 0, at most {FASTEST:,} per s")
+    """Raises SettingsError for a rate of 0 or less, or of more than one per microsecond."""
+    if not 0 < rate <= MAX_RATE:
+        raise SettingsError(f"rate is {rate:g}, but must be above 0, at most {MAX_RATE:,} per s")

@@ -1,9 +1,9 @@
 """(State, event tensor) -> (State, image): FireNet as a pure function, the body of a scan.
 
 Scheerlinck et al., WACV 2020: H (3x3 convolution, ReLU), G1 (ConvGRU), R1 (residual block), G2,
-R2, P (1x1 convolution, no activation); 16 channels, zero padding, no striding, no normalisation;
-37,777 parameters. Event tensors are (B, H, W, 5) and images (B, H, W), float32, nominally 0 to 1
-and not clipped here. The receptive field of one step is 19x19 (through the reset gate).
+R2, P (1x1 convolution, no activation); 16 channels, zero padding, no striding, no normalisation
+layers; 37,777 parameters. Event tensors are (B, H, W, 5). Images are (B, H, W) float32, nominally
+0 to 1 and not clipped here. The receptive field of one step is 19x19 (through the reset gate).
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ CHANNELS = 16
 @partial(jax.tree_util.register_dataclass, data_fields=["params"], meta_fields=["normalise"])
 @dataclass(frozen=True)
 class Weights:
-    """What a trained network is: its parameters, and whether it expects normalised tensors."""
+    """A trained network: its parameters, and whether it expects normalised tensors."""
 
     params: Any  # nested dict of float32 arrays, kernels (3, 3, in, out)
     normalise: bool  # FireNet True, FireNet+ False
@@ -48,7 +48,7 @@ def initial_state(batch: int, height: int, width: int) -> State:
 
 
 class Conv(nn.Module):
-    """Maps, seen as one -> as many as there are activations, each of `features` channels; 3x3."""
+    """Feature maps, concatenated -> one map of `features` channels per activation; kernel 3x3."""
 
     features: int
     activations: tuple[str, ...] = ("relu",)
@@ -71,9 +71,9 @@ class Conv(nn.Module):
 class ConvGRU(nn.Module):
     """h' = (1 - z) h + z q, with z, r = sigmoid(conv([x, h])) and q = tanh(conv([x, r h])).
 
-    Kernels have the input before the state; the update gate z weighs the candidate q, the other
-    way round than in Flax's own cells. `gates` holds both gates, reset before update: one
-    convolution with 32 outputs is faster than two with 16.
+    Kernels take the input before the state. The update gate z weighs the candidate q; in Flax's own
+    cells it weighs the state. `gates` holds both gates, reset before update: one convolution with
+    32 outputs is faster than two with 16.
     """
 
     features: int
@@ -90,7 +90,7 @@ class ConvGRU(nn.Module):
             convs = self.gates, self.candidate
             return blocks.gru(h, x, *(conv.parameters(2 * self.features) for conv in convs))
         r, z = self.gates(x, h)
-        if exists is not None:  # costs nothing here; a choice between h' and h would
+        if exists is not None:  # free here, unlike a choice between h' and h
             z = z * exists[:, None, None, None]
         (q,) = self.candidate(x, r * h)
         return (1 - z) * h + z * q
@@ -116,7 +116,7 @@ class ResidualBlock(nn.Module):
 
 
 class FireNet(nn.Module):
-    """The network; dtype is that of the convolutions, state and image stay float32."""
+    """The network. dtype is that of the convolutions; state and image stay float32."""
 
     dtype: Any = jnp.float32
 
@@ -126,8 +126,8 @@ class FireNet(nn.Module):
         self.res1 = ResidualBlock(CHANNELS, self.dtype)
         self.gru2 = ConvGRU(CHANNELS, self.dtype)
         self.res2 = ResidualBlock(CHANNELS, self.dtype)
-        # Always exact: it costs nothing, and in bfloat16 an image would have 8 bits or fewer.
-        # Begins at grey: from black, the first steps of training move every bias at once.
+        # Always float32: it costs nothing, and in bfloat16 an image would have at most 8 bits.
+        # Starts at grey: from black, the first steps of training shift every bias at once.
         self.prediction = nn.Conv(1, (1, 1), bias_init=nn.initializers.constant(0.5))
 
     def __call__(
@@ -149,13 +149,13 @@ def step(
     *,
     dtype=jnp.float32,
 ) -> tuple[State, jax.Array]:
-    """One window: (State, (B, H, W, 5)) -> (State, (B, H, W)), the same function everywhere.
+    """One window: (State, (B, H, W, 5)) -> (State, (B, H, W)).
 
-    On a CPU `native.step` computes it too, where nobody asks for gradients.
+    On a CPU `native.step` computes the same where no gradient is needed.
 
-    event_tensor: normalised if the weights ask for it (`tensors.normalise`).
-    exists: (B,) bool; where False the state stays as it was and the image means nothing (the event
-    tensor must be finite there too: zeros, for instance).
+    event_tensor: normalised if the weights expect it (`tensors.normalise`).
+    exists: (B,) bool; where False the state is unchanged and the image is undefined (the event
+    tensor must still be finite there, for example zeros).
     dtype: of the convolutions; jnp.bfloat16 trades accuracy for speed on accelerators.
     """
     if isinstance(params, Weights):
@@ -165,10 +165,10 @@ def step(
 
 
 def initial_params(key: jax.Array):
-    """Random parameters: orthogonal gates, He's normal numbers before a ReLU, zero biases.
+    """Random parameters: orthogonal for the GRUs, He normal before a ReLU, zero biases.
 
-    The original's default of PyTorch lets a signal fade to a tenth on its way to the image; in the
-    first steps of training half of the last layers then died.
+    With PyTorch's default, which the original uses, a signal fades to a tenth on its way to the
+    image, and half of the last layers died in the first steps of training.
     """
     tensor = jnp.zeros((1, 8, 8, BINS))
     return FireNet().init(key, initial_state(1, 8, 8), tensor)["params"]
@@ -177,7 +177,7 @@ def initial_params(key: jax.Array):
 def multiply_adds(height: int, width: int) -> int:
     """Multiply-adds of the convolutions for one image, each counted once: 37,600 per pixel.
 
-    Those that meet the padding's zeros count too. Table 2 of the paper has 9 % more.
+    Products with padding zeros are included. Table 2 of the paper has 9 % more.
     """
     c = CHANNELS
     head, residual_block, prediction = 9 * BINS * c, 2 * (9 * c * c), c

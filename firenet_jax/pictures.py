@@ -42,8 +42,8 @@ class Display:
     extremes: the darkest and brightest (--auto_hdr of the original program); fixed: 0 and 1, as the
     original program does by default."""
     bilateral: float = 0.0
-    """Smooth noise but not edges: sigma of a bilateral filter in grey levels, such as 25; 0
-    switches it off."""
+    """Smooth noise but keep edges: sigma of a bilateral filter in grey levels, such as 25; 0 turns
+    it off."""
 
     def __post_init__(self):
         for name in ("unsharp", "bilateral"):
@@ -56,7 +56,7 @@ class Display:
 
 
 class DisplayState(NamedTuple):
-    """The ranges of the last images, the newest at the end; nan where there were none yet."""
+    """The ranges of the last images, the newest at the end; nan before the first image."""
 
     low: jax.Array  # (B, 11) float32
     high: jax.Array  # (B, 11) float32
@@ -80,7 +80,7 @@ def _unsharp_weights() -> np.ndarray:
 
 
 def unsharp_kernel(amount: float) -> np.ndarray:
-    """(5, 5) float32: with it, `unsharp_mask` is one convolution, for programs of others."""
+    """(5, 5) float32: `unsharp_mask` as one convolution, for exported networks."""
     weights = _unsharp_weights()
     kernel = -amount * np.outer(weights, weights)
     kernel[2, 2] += 1 + amount
@@ -88,7 +88,7 @@ def unsharp_kernel(amount: float) -> np.ndarray:
 
 
 def unsharp_mask(images: jax.Array, amount: float) -> jax.Array:
-    """(..., H, W) -> (1 + amount) image - amount blurred; 5x5 kernel, zeros beyond the border."""
+    """(..., H, W) -> (1 + amount) image - amount blurred image; 5x5 kernel, zero padding."""
     blurred = images
     for axis in (-2, -1):
         size = blurred.shape[axis]
@@ -168,11 +168,11 @@ def _to_8_bit(images: jax.Array, sigma: float) -> jax.Array:
 
 @partial(jax.jit, static_argnames="sigma")
 def bilateral(images: jax.Array, sigma: float = 25.0) -> jax.Array:
-    """(..., H, W) in [0, 1] -> means of 5x5 pixels without the corners, of those that are alike.
+    """Bilateral filter: (..., H, W) in [0, 1] -> the same, smoothed except across edges.
 
-    Weights exp(-d^2 / (2 sigma^2)) for the distance d in pixels and for the difference in grey
-    levels of 255, at the 13 places with d <= 2; mirrored beyond the border (without repeating
-    it). As cv2.bilateralFilter(image, 5, sigma, sigma), but not rounded to 8 bits.
+    A mean over the 13 pixels within a distance of 2. Weights are exp(-d^2 / (2 sigma^2)), for the
+    distance d in pixels times for the difference in grey levels (0 to 255). The image is reflected
+    at the border. As cv2.bilateralFilter(image, 5, sigma, sigma), but not rounded to 8 bits.
     """
     height, width = images.shape[-2:]
     padded = jnp.pad(images, [(0, 0)] * (images.ndim - 2) + [(2, 2)] * 2, mode="reflect")
@@ -191,9 +191,9 @@ def bilateral(images: jax.Array, sigma: float = 25.0) -> jax.Array:
 def event_pictures(tensors: jax.Array) -> jax.Array:
     """Raw event tensors (..., H, W, 5) -> (..., H, W, 3) uint8: ON blue, OFF red, else white.
 
-    The colour is that of the sign of a pixel's votes, as in the original program.
+    The colour shows the sign of the sum of a pixel's votes, as in the original program.
     """
-    votes = jnp.round(tensors.sum(-1))[..., None]  # an event's two votes sum to 1 but for rounding
+    votes = jnp.round(tensors.sum(-1))[..., None]  # an event's two votes sum to 1, up to rounding
     white, blue, red = (
         jnp.array(colour, jnp.uint8) for colour in ([255] * 3, [0, 0, 255], [255, 0, 0])
     )

@@ -1,9 +1,9 @@
 """Event tensors -> images: FireNet's step under `jax.lax.scan`, and the whole program to pictures.
 
-Event tensors are (T, B, H, W, 5), images (T, B, H, W). State goes in and comes out, so a recording
-may be streamed in chunks of any T, and B recordings of different lengths may run side by side:
-`valid` (T, B) says which windows exist, and the others leave the state as it was. Images at given
-times are steps whose state is thrown away (instants.py).
+Event tensors are (T, B, H, W, 5), images (T, B, H, W). State is passed in and returned, so a
+recording can be streamed in chunks of any T. B recordings of different lengths run in parallel:
+`valid` (T, B) says which windows exist; the others leave the state unchanged. Images at given times
+are steps whose new state is discarded (instants.py).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -37,7 +37,7 @@ from firenet_jax.pictures import (
     initial_display_state,
 )
 from firenet_jax.tensors import (
-    IN_LISTS,
+    PACKED_SPECS,
     Packed,
     capacity,
     in_groups,
@@ -53,14 +53,16 @@ class Network:
     """How the network runs."""
 
     recurrent: bool = True
-    """--no-recurrent forgets everything between windows (ablation, Fig. 5 of the paper)."""
+    """--no-recurrent starts every window from a zero state (the ablation in Fig. 5 of the
+    paper)."""
     bfloat16: bool = False
-    """Convolutions in bfloat16, a little less accurate: for accelerators; on a CPU it is slower."""
+    """Compute convolutions in bfloat16, slightly less accurate. For accelerators; slower on a
+    CPU."""
     pad: int = 1
-    """Pad tensors by reflection to a multiple of this; 16 is what the original program does."""
+    """Pad tensors by reflection to a multiple of this many pixels. The original program uses 16."""
     color: bool = False
-    """Colours, of a sensor with a mosaic (rows of red and green, and of white or green and blue):
-    each is reconstructed by itself, three quarters more work."""
+    """Reconstruct colour, for a sensor with a colour filter array (RGBG or RGBW): each channel
+    separately, three quarters more work."""
 
 
 @partial(jax.jit, static_argnames=("recurrent", "dtype", "machine_code"))
@@ -76,15 +78,15 @@ def reconstruct(
 ) -> tuple[State, jax.Array]:
     """(State, (T, B, H, W, 5)) -> (State, images (T, B, H, W) float32).
 
-    tensors: as `event_tensors` gives them; normalised here if the weights ask for it.
-    valid: (T, B) or (T, 1) bool; where False the state stays as it was and the image means nothing
+    tensors: as `event_tensors` gives them; normalised here if the weights expect it.
+    valid: (T, B) or (T, 1) bool; where False the state is unchanged and the image is undefined
     (tensors must be finite there too).
     recurrent: False starts every window from a zero state (the state returned is zero).
-    machine_code: False leaves all to XLA. Else, on a CPU and in float32, the step is `native.step`,
-    where there is one; not with FIRENET_NATIVE=0 in the environment, nor in what is exported.
+    machine_code: False uses XLA alone. True uses `native.step` where it exists: on a CPU, in
+    float32, unless FIRENET_NATIVE=0 is set or the function is exported.
     Gradients, in reverse mode only, are those of `network.step`.
-    Tensors, state and parameters of types that float32 holds exactly become float32.
-    Raises ValueError for other types, and where shapes do not belong together.
+    Tensors, state and parameters are converted to float32 if their type converts exactly.
+    Raises ValueError for other types and for shapes that do not match.
     """
     weights, state, tensors, valid = _checked(weights, state, tensors, valid)
     if not recurrent:
@@ -103,7 +105,7 @@ def _by_xla(recurrent: bool, dtype, weights: Weights, state: State, tensors, val
 def _by_machine_code(recurrent: bool, weights: Weights, state: State, tensors, valid):
     packed, normalised = native.pack(weights.params), replace(weights, normalise=False)
     native_step = partial(native.step, packed, normalise=weights.normalise)
-    if len(tensors) == 1:  # not in place: the caller's state stays
+    if len(tensors) == 1:  # not in place, which would overwrite the caller's state
         native_step = partial(native_step, in_place=False)
     kept, images = _scan(native_step, recurrent, normalised, tuple(state), tensors, valid)
     return State(*kept), images
@@ -112,7 +114,7 @@ def _by_machine_code(recurrent: bool, weights: Weights, state: State, tensors, v
 def _scan(step, recurrent: bool, weights: Weights, state, tensors, valid):
     def body(state, inputs):
         tensor, exists = inputs
-        # Here, not for all windows at once: sums would be rounded otherwise for each T.
+        # Here, not for all windows at once: the rounding of sums would depend on T.
         tensor = normalise(tensor) if weights.normalise else tensor
         new, image = step(state, tensor, exists)
         return new if recurrent else state, image
@@ -127,7 +129,7 @@ def _quickest(recurrent, *inputs):
 
 
 def _forward(recurrent, *inputs):
-    """Machine code keeps nothing of what a gradient needs."""
+    """By XLA: machine code does not keep the values that a gradient needs."""
     return jax.vjp(partial(_by_xla, recurrent, jnp.float32), *inputs)
 
 
@@ -138,12 +140,12 @@ def _backward(recurrent, gradient_of, cotangents):
 _quickest.defvjp(_forward, _backward)
 
 
-# --- The door: the same for both ways
+# --- Argument checks, the same for XLA and machine code
 
 
 def _checked(weights: Weights, state: State, tensors, valid):
-    """All of `reconstruct`'s arrays in float32; raises ValueError where they do not fit, TypeError
-    for what is no weights or state."""
+    """`reconstruct`'s arrays in float32. Raises ValueError if they do not match, TypeError for
+    other objects in place of weights or state."""
     if not isinstance(weights, Weights):
         raise TypeError(
             f"weights are a {type(weights).__name__}: pass Weights, as load_weights gives, whole "
@@ -179,13 +181,13 @@ def _checked(weights: Weights, state: State, tensors, valid):
 
 
 def _as_float32(tree, name: str):
-    """Raises ValueError for types with numbers that float32 rounds."""
+    """Raises ValueError for types that float32 would round."""
 
     def one(x):
         kind = jnp.result_type(x)
         if jnp.issubdtype(kind, jnp.floating):
             exact = jnp.finfo(kind).bits <= 32
-        else:  # all whole numbers of 24 bits are float32
+        else:  # float32 holds integers of 24 bits exactly
             whole = jnp.issubdtype(kind, jnp.integer)
             exact = kind == jnp.bool_ or (whole and jnp.iinfo(kind).max <= 2**24)
         if not exact:
@@ -218,21 +220,21 @@ def _shapes_of_params() -> dict[str, tuple[int, ...]]:
     return {jax.tree_util.keystr(path): leaf.shape for path, leaf in _leaves(shapes)}
 
 
-# --- Images at given times: steps that are kept, and looks
+# --- Images at given times: kept steps, and looks
 
 
 class Committed(NamedTuple):
-    """The two states that were kept last: what images at times in between begin from."""
+    """The last two kept states: a look starts from a mean of them."""
 
     before: State
     last: State
 
 
 class Looks(NamedTuple):
-    """What T steps of B recordings are, as `instants.steps` says."""
+    """Which of T steps of B recordings are looks (see `instants`)."""
 
-    looks: np.ndarray  # (T, B) bool: an image whose new state is thrown away; else it is kept
-    share: np.ndarray  # (T, B) float32: of a look, how far from `before` to `last` it begins
+    looks: np.ndarray  # (T, B) bool: True: an image whose new state is discarded; False: kept
+    share: np.ndarray  # (T, B) float32: a look starts from (1 - share) before + share last
 
 
 @partial(jax.jit, static_argnames=("recurrent", "dtype", "machine_code"))
@@ -249,7 +251,7 @@ def reconstruct_at(
 ) -> tuple[Committed, jax.Array]:
     """(Committed, (T, B, H, W, 5), Looks) -> (Committed, images (T, B, H, W) float32).
 
-    As `reconstruct`, for steps of which some only look. Not to be differentiated.
+    As `reconstruct`, but some of the steps are looks. Not differentiable.
     """
     weights, last, tensors, valid = _checked(weights, committed.last, tensors, valid)
     _, before, _, _ = _checked(weights, committed.before, tensors, valid)
@@ -269,7 +271,7 @@ def _at_by_xla(recurrent: bool, dtype, weights: Weights, *inputs):
 
 def _at_by_machine_code(recurrent: bool, weights: Weights, committed: Committed, tensors, *inputs):
     packed, normalised = native.pack(weights.params), replace(weights, normalise=False)
-    # Not in place: the state that a look begins from is still wanted.
+    # Not in place: the state that a look starts from is still needed.
     native_step = partial(native.step, packed, normalise=weights.normalise, in_place=False)
     kept = Committed._make(map(tuple, committed))
     kept, images = _scan_at(native_step, recurrent, normalised, kept, tensors, *inputs)
@@ -278,7 +280,7 @@ def _at_by_machine_code(recurrent: bool, weights: Weights, committed: Committed,
 
 def _scan_at(step, recurrent: bool, weights: Weights, committed: Committed, tensors, steps, valid):
     def chosen(choice, a, b):
-        """Of each recording a where the choice says so, else b."""
+        """a for the recordings where `choice` is True, else b."""
         return jax.tree.map(lambda a, b: jnp.where(choice[:, None, None, None], a, b), a, b)
 
     def between(share, a, b):
@@ -288,7 +290,7 @@ def _scan_at(step, recurrent: bool, weights: Weights, committed: Committed, tens
     def body(committed, inputs):
         tensor, steps, exists = inputs
         tensor = normalise(tensor) if weights.normalise else tensor
-        # A step that is kept begins from the last state exactly: 0 a + 1 b.
+        # A kept step starts from exactly the last state: 0 a + 1 b.
         share = jnp.where(steps.looks, steps.share, 1.0)
         new, image = step(between(share, *committed), tensor, exists)
         if recurrent:
@@ -309,16 +311,15 @@ def images_at(
     chunk: int = 8,
     **windows,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Recording, times -> chunks of (times (n,) int64, images (n, H, W) float32), as they come.
+    """Recording, times -> chunks of (times (n,) int64, images (n, H, W) float32).
 
-    times: microseconds on the recording's clock, in order; also endless ones, such as
-    `instants.grid` gives. Of those before the first event and after the last one there is no image.
-    windows: of the states that are kept, as `windows.Windows` takes them; without any 0.35 events
-    per pixel, at most 40 ms, as in `firenet reconstruct`. An image depends on these and on the
-    events up to its time, not on which other times are asked for.
-    chunk: steps that the device takes at once; nothing is compiled for each length, and memory
-    holds a chunk, whatever the recording's length.
-    Raises ValueError for windows that cannot be, RecordingError where the file is damaged.
+    times: microseconds on the recording's clock, in order; may be endless, such as `fj.grid`. Times
+    before the first event or after the last one get no image.
+    windows: those that update the state, as `windows.Windows` takes them; default: 0.35 events per
+    pixel, at most 40 ms, as in `firenet reconstruct`. An image depends on these and on the events
+    up to its time, not on which other times are requested.
+    chunk: steps per call of the device. Memory holds one chunk, whatever the recording's length.
+    Raises ValueError for invalid windows, RecordingError if the file is damaged.
     """
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but must be 1 or more steps")
@@ -340,8 +341,8 @@ def images_at(
 
 
 def looks_of(groups: Sequence[Sequence[Step]], length: int) -> Looks:
-    """The steps of each of B recordings, at most `length` -> (T, B) on the host; what is missing
-    looks at nothing."""
+    """The steps of B recordings, at most T = `length` each -> (T, B) arrays on the host; missing
+    steps count as kept."""
     looks = np.zeros((length, len(groups)), bool)
     share = np.ones((length, len(groups)), np.float32)
     for b, group in enumerate(groups):
@@ -354,19 +355,19 @@ def looks_of(groups: Sequence[Sequence[Step]], length: int) -> Looks:
 
 
 class Session(NamedTuple):
-    """All that must be kept between two chunks of B recordings."""
+    """The state of B recordings between two chunks."""
 
     network: State | Committed
     display: DisplayState
     channels: "Session | None" = None
-    """The same of red, green and blue, leading axes (B, 3); None without colours."""
+    """The same for red, green and blue, leading axes (B, 3); None without colours."""
 
 
 def initial_session(
     batch: int, height: int, width: int, network: Network, at_times: bool = False
 ) -> Session:
-    """at_times: for steps of which some only look, see `reconstruct_at`.
-    Raises ValueError for colours of a sensor with an odd side."""
+    """at_times: for images at given times, see `reconstruct_at`.
+    Raises SettingsError for colours from a sensor with an odd side."""
     (top, bottom), (left, right) = padding(height, width, network.pad)
     state = initial_state(batch, top + height + bottom, left + width + right)
     state = Committed(state, state) if at_times else state
@@ -420,11 +421,11 @@ def events_to_pictures(
     (T, B, H, W) uint8, with colours (T, B, H, W, 3); with preview (T, B, H, 2 W, 3): the events
     beside the reconstruction.
     valid: (T, B) bool, as in `reconstruct`.
-    steps: which only look, for a session `at_times`; pictures of those that are kept mean nothing.
-    raw: images as the network gives them, (T, B, H, W) float32, in place of pictures.
+    steps: which steps are looks, for a session `at_times`; pictures of kept steps are undefined.
+    raw: the network's images, (T, B, H, W) float32, in place of pictures.
     mesh: devices that share the B recordings equally, for events from `pack_for_devices`.
     """
-    # Numbers are normalised before they are padded or dealt out to colours.
+    # Tensors are normalised before they are padded or split into colour channels.
     early = weights.normalise and (network.pad > 1 or network.color)
     dtype = jnp.bfloat16 if network.bfloat16 else jnp.float32
     run = partial(reconstruct, recurrent=network.recurrent, dtype=dtype)
@@ -452,7 +453,7 @@ def events_to_pictures(
         if raw:
             images = images[:, :, top : top + height, left : left + width]
             return Session(state, session.display), images
-        # The original program crops last: its mask and its range see the padded image.
+        # As in the original program, the mask and the intensity range see the padded image.
         ranges, greys = display(session.display, images, valid, settings)
         greys = greys[:, :, top : top + height, left : left + width]
         return Session(state, ranges), greys
@@ -478,6 +479,6 @@ def events_to_pictures(
         return after, pictures
 
     if mesh is not None:
-        specs = REPLICATED, BATCH, IN_LISTS, TIME_BATCH, TIME_BATCH
+        specs = REPLICATED, BATCH, PACKED_SPECS, TIME_BATCH, TIME_BATCH
         one_device = on_each_device(one_device, specs, (BATCH, TIME_BATCH), mesh)
     return one_device(weights, session, events, valid, steps)

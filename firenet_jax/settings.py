@@ -1,11 +1,11 @@
-"""Words and numbers of a command line -> what they mean, or a SettingsError."""
+"""Command-line values -> checked, parsed values, or a SettingsError."""
 
 import math
 from typing import overload
 
 from firenet_jax.errors import SettingsError
 
-LONGEST_SIDE = 2**15  # pixels of a sensor's side at most: coordinates are int16
+LONGEST_SIDE = 2**15  # pixels; coordinates are int16
 
 
 @overload
@@ -27,13 +27,13 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
 
 
 def check_seed(seed: int) -> None:
-    """Raises SettingsError unless jax, numpy and grain all take it."""
+    """Raises SettingsError unless jax, numpy and grain all accept this seed."""
     if not 0 <= seed < 2**32:
         raise SettingsError(f"seed is {seed}, but must be 0 or more, and less than 2^32")
 
 
 def check_range(name: str, bounds: tuple[float, float]) -> None:
-    """Raises SettingsError unless a number can be drawn log-uniformly between these."""
+    """Raises SettingsError unless a number can be drawn log-uniformly between these bounds."""
     least, greatest = bounds
     if not (0 < least <= greatest and math.isfinite(greatest)):
         raise SettingsError(

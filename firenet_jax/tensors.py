@@ -6,9 +6,9 @@ Event tensors are (T, B, H, W, bins) float32: T windows in time order, B recordi
     E(x, y, t_n) = sum_i p_i max(0, 1 - |t_n - t*_i|)
     t*_i = (bins - 1) (t_i - t_min) / (t_max - t_min)
 
-Windows are ragged: they travel as one flat, padded list of events, and sums over its segments build
-the tensors of all. Only the list's length is padded, to a few fixed sizes, so nothing recompiles as
-data flows.
+Windows are ragged, so they are passed as one flat, padded list of events; segment sums over that
+list build all tensors. Only its length is padded, to a few fixed sizes, so new data does not
+trigger recompilation.
 """
 
 import itertools
@@ -27,34 +27,34 @@ from firenet_jax.errors import SettingsError
 from firenet_jax.events import BINS, Events, Recording, check_recording
 from firenet_jax.windows import Windows, cut
 
-# A flat list of events is padded to one of these sizes: at most 8 times too long, at a few ns
-# for each event too many, against a compilation of seconds for each new size; from a million on
-# at most twice, because there it is memory that counts.
+# A flat list of events is padded to one of these sizes. Padding costs a few ns per event, a new
+# size costs seconds of compilation, so small lists may be padded up to 8 times; from a million
+# events on memory matters more, so at most twice.
 CAPACITIES = 2**14, 2**17, *(2**k for k in range(20, 30))
 
-BLOCK, BLOCKS = 2**17, 8  # events that vote at once on a CPU, and how many such steps in a row
+BLOCK, BLOCKS = 2**17, 8  # on a CPU: events per step of the scan, and how far it is unrolled
 
 
 @cache
 def _helper(process: int) -> ThreadPoolExecutor:
-    """Copies beside the thread that packs; a forked process has none of its parent's threads."""
+    """A thread that copies alongside `pack`; one per process, as a fork inherits no threads."""
     return ThreadPoolExecutor(1, "pack")
 
 
 class Packed(NamedTuple):
-    """The events of T x B windows as one flat list of E places, some unused at the end."""
+    """The events of T x B windows as one flat list of E entries, some unused at the end."""
 
     t: np.ndarray  # (E,) int32, microseconds modulo 2^32
     x: np.ndarray  # (E,) int16
     y: np.ndarray  # (E,) int16
     p: np.ndarray  # (E,) bool
-    window: np.ndarray  # (E,) int16, t B + b; T B for unused places
+    window: np.ndarray  # (E,) int16, t B + b; T B for unused entries
     t_min: np.ndarray  # (T, B) int32, microseconds modulo 2^32
     duration: np.ndarray  # (T, B) float32, microseconds, at least 1
 
 
 def capacity(events: int, at_least: int = 0) -> int:
-    """The padded size for so many events; pass the last one, so that sizes only grow."""
+    """The padded size for this many events. at_least: the last size, so that sizes only grow."""
     for size in CAPACITIES:
         if size >= max(events, at_least):
             return size
@@ -68,11 +68,11 @@ def pack(
 ) -> Packed:
     """T rows of B windows -> one flat list for the device.
 
-    size: padded length, at least the number of events; None: `capacity` of it.
+    size: padded length, at least the number of events; None: `capacity` of that number.
     bounds: (T, B, 2) int64 microseconds, t_min and t_max of each window; None: the times of its
-    first and its last event, the least and the greatest, as events are in time order.
-    Raises ValueError where rows are missing or of unequal length, the events do not fit into
-    `size`, or there are 2^15 windows or more.
+    first and last event.
+    Raises ValueError if rows are missing or of unequal length, if the events do not fit into
+    `size`, or if there are 2^15 windows or more.
     """
     if not windows or not windows[0] or {len(row) for row in windows} != {len(windows[0])}:
         raise ValueError("windows are T rows of B windows each, T and B at least 1")
@@ -109,7 +109,7 @@ def pack(
             times, span = window.t, int(t_max[number] - t_min[number])
             if span >= 2**31:
                 # The device subtracts modulo 2^32, which is exact below 36 minutes. A longer
-                # window is measured in coarser units: float32 could not tell the difference.
+                # window uses coarser units; float32 could not tell the difference.
                 coarser = span.bit_length() - 31
                 times = (times - t_min[number]) >> coarser
                 packed.t_min.flat[number] = 0
@@ -117,7 +117,7 @@ def pack(
             place = slice(starts[number], stops[number])
             np.copyto(packed.t[place], times, casting="unsafe")  # modulo 2^32
 
-    # Half of the bytes are times: of a long list, another thread copies them meanwhile.
+    # Half of the bytes are times. In a long list another thread copies them at the same time.
     times_copied = _helper(os.getpid()).submit(copy_times) if size >= BLOCK else copy_times()
     for number, window in enumerate(flat):
         place = slice(starts[number], stops[number])
@@ -131,16 +131,16 @@ def pack(
     return packed
 
 
-# How the devices of `pack_for_devices` share its arrays.
-IN_LISTS = Packed._make([BATCH] * 5 + [TIME_BATCH] * 2)
+# How the arrays of `pack_for_devices` are sharded.
+PACKED_SPECS = Packed._make([BATCH] * 5 + [TIME_BATCH] * 2)
 
 
 def pack_for_devices(
     windows: Sequence[Sequence[Events]], devices: int, at_least: int = 0
 ) -> Packed:
-    """T rows of B windows -> a list for each device, of B / devices recordings, one after another.
+    """T rows of B windows -> one list per device, of B / devices recordings, concatenated.
 
-    at_least: places of a list, as in `capacity`.
+    at_least: entries of a list, as in `capacity`.
     """
     share = len(windows[0]) // devices
     parts = [[row[k * share :][:share] for row in windows] for k in range(devices)]
@@ -154,10 +154,10 @@ def pack_for_devices(
 
 
 def _columns(size: int, kinds: Sequence[type]) -> list[np.ndarray]:
-    """Empty arrays of one length that share a block of memory, each from a multiple of 64 bytes on.
+    """Empty arrays of one length that share a block of memory, each aligned to 64 bytes.
 
-    XLA's CPU takes such an array as it is, where others are copied (1 to 2 ms for a million
-    events). For one large block numpy asks for huge pages, for several smaller ones it does not.
+    XLA's CPU backend uses aligned arrays in place and copies others (1 to 2 ms for a million
+    events). numpy requests huge pages for one large block, but not for several smaller ones.
     """
     starts = [0]
     for kind in kinds:
@@ -174,9 +174,9 @@ def _columns(size: int, kinds: Sequence[type]) -> list[np.ndarray]:
 def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
     """Packed events -> event tensors (T, B, H, W, 5) float32, not normalised (Eq. 1).
 
-    Every event votes in the two bins around its time. Events outside the sensor vote nowhere;
-    events of one single time all vote in bin 0; a window without events gives zeros.
-    Raises SettingsError where the tensors would have 2^31 numbers or more.
+    Every event votes in the two bins around its time. Events outside the sensor are ignored. If all
+    events of a window have the same time, they vote in bin 0. An empty window gives zeros.
+    Raises SettingsError if the tensors would have 2^31 numbers or more.
     """
     steps, batch = packed.t_min.shape
     windows, plane = steps * batch, height * width
@@ -188,29 +188,29 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
 
     def vote(planes, columns):
         t, x, y, p, window = columns
-        # Indices of unused places reach past the end of t_min; they are clamped and dropped later.
-        # As unsigned numbers, what is negative lies past every end too.
+        # Unused entries index past the end of t_min: the index is clamped, the vote dropped below.
+        # As unsigned integers, negative coordinates lie outside too.
         window, x, y = (column.astype(jnp.uint32) for column in (window, x, y))
         since = t - packed.t_min.ravel()[window]  # int32: exact, modulo 2^32
         t_star = (BINS - 1) * since.astype(jnp.float32) / packed.duration.ravel()[window]
         seen = (x < width) & (y < height) & (window < windows)
         pixel = jnp.where(seen, (window * height + y) * width + x, jnp.uint32(2**31))
 
-        # The triangle is not zero in two bins only, those around t*, of which one is even and one
-        # odd: two sums that share nothing, so that a CPU runs them side by side. One plane a bin,
-        # so that consecutive events, close in time, vote close in memory.
+        # The triangle is non-zero only in the two bins around t*, one even and one odd: two
+        # independent sums, which a CPU runs in parallel. One plane per bin, so that consecutive
+        # events, close in time, vote close in memory.
         sums = []
         for first, (bins, planes_of) in enumerate(zip((even, odd), planes, strict=True)):
             k = jnp.floor((t_star + 1 - first) / 2)  # of bins first, first + 2, ... the one near t*
             votes = jnp.where(p, 1.0, -1.0) * (1 - jnp.abs(2 * k + first - t_star))
             k = jnp.clip(k, -1, bins).astype(jnp.int32).astype(jnp.uint32)
-            place = k * (windows * plane) + pixel  # what is past the end is dropped
+            place = k * (windows * plane) + pixel  # indices past the end are dropped
             sums.append(planes_of.at[place].add(votes, mode="drop"))
         return tuple(sums), None
 
-    # A sum over segments, block by block: what a block votes stays in a CPU's cache. XLA's CPU
-    # runs steps side by side only where more than eight are ready, hence several blocks in one
-    # body. Accelerators take the list as one block.
+    # A segment sum, block by block, so that a block's votes stay in a CPU's cache. XLA's CPU
+    # backend runs operations in parallel only if more than eight are ready, so the loop is
+    # unrolled. Accelerators take the list as one block.
     size = packed.t.shape[0]
     block = BLOCK if jax.default_backend() == "cpu" and size % BLOCK == 0 else size
     columns = jax.tree.map(lambda column: column.reshape(-1, block), packed[:5])
@@ -218,16 +218,16 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
     planes, _ = jax.lax.scan(vote, nothing, columns, unroll=BLOCKS)
     planes = [sums.reshape(-1, 1, steps, batch, height, width) for sums in planes]
     in_order = [planes[number % 2][number // 2] for number in range(BINS)]
-    # Joined, then transposed: twice as fast as jnp.stack.
+    # Concatenated, then transposed: twice as fast as jnp.stack.
     return jnp.concatenate(in_order).transpose(1, 2, 3, 4, 0)
 
 
 def normalise(tensors: jax.Array) -> jax.Array:
-    """(..., H, W, bins) -> the same, its non-zero entries with mean 0 and standard deviation 1.
+    """(..., H, W, bins) -> the same, non-zero entries scaled to mean 0 and standard deviation 1.
 
-    Every window alone, over all bins, with the population deviation, as in the original program
-    (the paper says "unit norm"). Where the deviation is below 1e-6 the result is zero, so that an
-    empty window and one with a single value stay finite.
+    Each window by itself, over all bins, with the population standard deviation, as in the original
+    program (the paper says "unit norm"). If the deviation is below 1e-6 the result is zero, so that
+    empty windows and windows with a single value stay finite.
     """
     axes = (-3, -2, -1)
     voted = tensors != 0
@@ -244,11 +244,11 @@ def event_tensors(
 ) -> Iterator[tuple[jax.Array, np.ndarray]]:
     """Recording -> chunks of (tensors (T, 1, H, W, 5) float32, not normalised, times (T,) int64).
 
-    times: microseconds of each window's last event; of its end where it holds none. chunk: T; the
-    last chunk may be shorter, and programs that take it are then compiled for that length too.
-    windows, of which one may be given: events_per_pixel=0.35 (the default), events (a number),
-    duration (milliseconds) or between_frames=True; see `windows.Windows` for more.
-    Raises ValueError for windows that cannot be, RecordingError where the file is damaged.
+    times: microseconds, that of each window's last event; for an empty window, its end.
+    chunk: T. The last chunk may be shorter, which compiles your functions for that length too.
+    windows: one of events_per_pixel=0.35 (the default), events (a number), duration (milliseconds)
+    or between_frames=True; see `windows.Windows` for more.
+    Raises ValueError for invalid windows, RecordingError if the file is damaged.
     """
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but must be 1 or more windows")

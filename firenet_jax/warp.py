@@ -1,4 +1,4 @@
-"""Image, displacement -> image, visible: the one bilinear sampler, and backward warping with it.
+"""Image, displacement -> image, visible: bilinear sampling, and backward warping with it.
 
 Images are (..., H, W) float32; displacements (..., H, W, 2) float32 in pixels, x then y, on the
 grid of the result. A pixel x of the result is looked up at x - d(x) (backward warping: d is the
@@ -13,8 +13,8 @@ import jax.numpy as jnp
 def sample(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
     """(H, W) at columns x and rows y, any one shape -> its bilinear interpolation there.
 
-    Beyond the border stands the value of the nearest pixel on it. The gradient with respect to
-    image, x and y is finite everywhere.
+    Beyond the border the value is that of the nearest border pixel. The gradient with respect to
+    image, x and y is always finite.
     """
     height, width = image.shape
     x, y = jnp.clip(x, 0, width - 1.0), jnp.clip(y, 0, height - 1.0)
@@ -25,12 +25,12 @@ def sample(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
     flat, place = image.reshape(-1), row * width + column
 
     def at(offset: int) -> jax.Array:
-        # "clip" costs nothing and keeps the look-up inside, whatever comes (nan, W = 1)
+        # "clip" costs nothing and keeps the index in bounds in all cases (nan, W = 1).
         return flat.at[place + offset].get(mode="clip")
 
     a, b = at(0), at(1)
     c, d = at(width), at(width + 1)
-    # In this form a weight of 0 or 1 gives one of the pixels exactly.
+    # In this form weights of 0 and 1 give exactly one of the pixels.
     top, bottom = (1 - right) * a + right * b, (1 - right) * c + right * d
     return (1 - down) * top + down * bottom
 
@@ -39,8 +39,8 @@ def sample(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
 def warp(image: jax.Array, displacement: jax.Array) -> tuple[jax.Array, jax.Array]:
     """(..., H, W), (..., H, W, 2) -> warped (..., H, W), visible (..., H, W) bool.
 
-    warped(x) = image(x - displacement(x)), interpolated bilinearly. Where that place is outside
-    the picture, by however little, visible is False and warped holds the nearest border pixel.
+    warped(x) = image(x - displacement(x)), interpolated bilinearly. Where that position is outside
+    the image, however slightly, visible is False and warped holds the nearest border pixel.
     """
     height, width = image.shape[-2:]
     if displacement.shape != (*image.shape, 2):

@@ -1,7 +1,7 @@
-"""Event stream -> windows: where to cut a recording, kept apart from reading and from voxels.
+"""Event stream -> windows: where to cut a recording, separate from reading and from voxels.
 
-Windows are consecutive and, unless `step` says otherwise, do not overlap. The last one may be
-partial: no event is lost. Memory holds one window and one chunk, whatever the recording's length.
+Windows are consecutive and, without `step`, do not overlap. The last one may be partial: no event
+is lost. Memory holds one window and one chunk, whatever the recording's length.
 """
 
 import itertools
@@ -17,17 +17,17 @@ import tyro
 from firenet_jax.errors import RecordingError, SettingsError, logger
 from firenet_jax.events import Events, Recording, concatenate, counted
 
-APART = 3_600_000_000  # microseconds between events of one clock, or events and frames, at most
-MOST = 2**31 - 1
-LONGEST = 40.0  # milliseconds of a window where none are chosen: 25 pictures per second at least
-PICTURES = 20  # of a recording that is too short for so many of these, at least
+MAX_GAP = 3_600_000_000  # microseconds between two events, or events and frames, of one clock
+MAX_NUMBER = 2**31 - 1
+DEFAULT_LONGEST = 40.0  # milliseconds: at least 25 pictures per second
+MIN_WINDOWS = 20  # of a short recording: its windows are shorter than DEFAULT_LONGEST
 
 
 class Window(NamedTuple):
     """The events that become one event tensor, and so one image."""
 
     events: Events
-    time: int  # int64 us: of the last event; of the window's end where it has none
+    time: int  # int64 us: that of the last event; of an empty window, its end
 
 
 @dataclass(frozen=True)
@@ -37,17 +37,17 @@ class Windows:
     events: Annotated[int | None, tyro.conf.arg(aliases=["-N"])] = None
     """A window holds this many events."""
     events_per_pixel: float | None = None
-    """A window holds this many events per pixel of the sensor (0.35 if nothing is chosen)."""
+    """A window holds this many events per pixel of the sensor (default: 0.35)."""
     duration: Annotated[float | None, tyro.conf.arg(aliases=["-T"])] = None
     """A window lasts this many milliseconds, on a grid that starts at the first event."""
     between_frames: Annotated[bool, tyro.conf.arg(name="frame-to-frame")] = False
-    """A window lasts from one of the camera's frames to the next, however many events that are."""
+    """A window lasts from one of the camera's frames to the next."""
     step: float | None = None
-    """Windows start this far apart, in events (or ms, with --duration): less than the window
-    makes them overlap."""
+    """Windows start this many events apart (milliseconds, with --duration). If this is less than
+    the window, windows overlap."""
     longest: float | None = None
-    """A window of events ends after so many milliseconds at the latest. Where no way to cut is
-    chosen: 40, or a twentieth of a recording that is shorter than 0.8 s."""
+    """A window of events ends after this many milliseconds at the latest. If no kind of window is
+    chosen: 40, or a twentieth of a recording shorter than 0.8 s."""
 
     def __post_init__(self):
         ways = [self.events, self.events_per_pixel, self.duration, self.between_frames or None]
@@ -58,8 +58,10 @@ class Windows:
             )
         for name in ("events", "events_per_pixel", "duration", "step", "longest"):
             value = getattr(self, name)
-            if value is not None and not 0 < value <= MOST:
-                raise SettingsError(f"{name} is {value}, but must be more than 0, at most {MOST}")
+            if value is not None and not 0 < value <= MAX_NUMBER:
+                raise SettingsError(
+                    f"{name} is {value}, but must be more than 0, at most {MAX_NUMBER}"
+                )
         if self.step is not None:
             if self.between_frames:
                 raise SettingsError(
@@ -80,23 +82,23 @@ class Windows:
             raise SettingsError(f"duration is {self.duration} ms, but times are whole microseconds")
 
     def count(self, pixels: int) -> int:
-        """Events in a full window of a sensor with this many pixels, unless time decides."""
+        """Events in a full window of a sensor with this many pixels (windows in time ignore it)."""
         if self.events is not None:
             return self.events
         return max(1, round((self.events_per_pixel or 0.35) * pixels))
 
 
 def usual(chunks: Iterable[Events]) -> Windows:
-    """The windows of a recording for which none are chosen: 0.35 events per pixel, but at most
-    40 ms, so that where little moves there still is a picture; of a recording shorter than 20 of
-    these, a twentieth of it. Reads that much of it."""
+    """The default windows of a recording: 0.35 events per pixel, but at most 40 ms, so that slow
+    scenes get pictures too. A recording shorter than 0.8 s gets windows of at most a twentieth of
+    its length. Reads up to 0.8 s of the recording."""
     first = last = None
     for events in chunks:
         first = int(events.t[0]) if first is None else first
         last = int(events.t[-1])
-        if last - first >= PICTURES * 1000 * LONGEST:
-            return Windows(longest=LONGEST)
-    return Windows(longest=max(((last or 0) - (first or 0)) // PICTURES, 1) / 1000)
+        if last - first >= MIN_WINDOWS * 1000 * DEFAULT_LONGEST:
+            return Windows(longest=DEFAULT_LONGEST)
+    return Windows(longest=max(((last or 0) - (first or 0)) // MIN_WINDOWS, 1) / 1000)
 
 
 def in_words(windows: Windows, pixels: int) -> str:
@@ -123,10 +125,10 @@ def cut(
 ) -> Iterator[Window]:
     """Recording -> its windows, as `windows` says.
 
-    chunks: the recording's events after filters; None: as they are.
+    chunks: the recording's events after filters; None: unfiltered.
     begin: microseconds, where the first window in time begins; None: at the first event.
-    Raises RecordingError where windows between frames are asked of a recording without frames, and,
-    of windows in time, where no event comes for more than an hour; ValueError where the step is
+    Raises RecordingError if windows between frames are requested and the recording has no frames,
+    and, for windows in time, if no event comes for more than an hour; SettingsError if the step is
     longer than the window.
     """
     chunks = iter(recording.events() if chunks is None else chunks)
@@ -158,7 +160,7 @@ def cut(
 
 
 def warn_if_unusual(events: float, pixels: int) -> None:
-    """Says when windows hold fewer or more events than the network's training made usual."""
+    """Warns if windows are much sparser or denser than those that the network was trained on."""
     density = events / pixels
     if not 0.1 <= density <= 1.5:
         logger.warning(
@@ -187,8 +189,8 @@ def _by_count(chunks: Iterator[Events], count: int, step: int) -> Iterator[Windo
 
 
 def _by_count_or_time(chunks: Iterator[Events], count: int, longest: int) -> Iterator[Window]:
-    """Windows that end with their event number `count`, or before an event that comes `longest`
-    microseconds after their first one or later. None is empty."""
+    """Windows of `count` events that last less than `longest` microseconds; a window that would
+    last longer has fewer events. None is empty."""
     held = Events.empty()
     for chunk in chunks:
         held, start = concatenate([held, chunk]) if len(held) else chunk, 0
@@ -227,7 +229,7 @@ def _by_time(path, chunks: Iterator[Events], begin: int | None, spans) -> Iterat
         yield _window(held, a, b, stop)
         if ended and b == len(held):
             return
-        if held.t[b] - stop > APART:  # a broken time: there may be billions of windows up to it
+        if held.t[b] - stop > MAX_GAP:  # a broken time: there may be billions of windows up to it
             raise RecordingError(
                 f"{path}: no event from {stop / 1e6:.6f} to {held.t[b] / 1e6:.6f} s, more than an "
                 "hour: leave one side out with --start or --stop, or use --events-per-pixel"
@@ -241,9 +243,9 @@ def _window(events: Events, start: int, stop: int, end: int = 0) -> Window:
 
 
 def _grid_spans(duration: float, step: float, first: int) -> Iterator[tuple[int, int]]:
-    """Milliseconds -> microsecond spans; each is computed from k, so rounding never adds up.
+    """Milliseconds -> spans in microseconds. Each is computed from k, so rounding never adds up.
 
-    In fractions: of floats, an end and the next start would round to two microseconds.
+    In fractions, because with floats an end and the next start could round to two microseconds.
     """
     apart, long = (Fraction(str(value)) * 1000 for value in (step, duration))
     for k in itertools.count():
@@ -251,11 +253,11 @@ def _grid_spans(duration: float, step: float, first: int) -> Iterator[tuple[int,
 
 
 def _frame_spans(path, times: np.ndarray, first: int) -> Iterator[tuple[int, int]]:
-    """Frame times -> spans, the clock of the frames going on before the first and after the last.
+    """Frame times -> spans. The frames' clock is extended before the first and after the last.
 
-    So a recording whose frames begin late or end early has no window of all the rest.
+    So if frames begin late or end early, the rest of the recording is not one long window.
     """
-    if max(times[0] - first, first - times[-1]) > APART:
+    if max(times[0] - first, first - times[-1]) > MAX_GAP:
         raise RecordingError(
             f"{path}: its frames are from {times[0] / 1e6:.6f} to {times[-1] / 1e6:.6f} s, its "
             f"events begin at {first / 1e6:.6f} s: they are not on one clock; use "

@@ -1,5 +1,5 @@
-"""What all tests share: strict JAX flags, compiled programs, the slow switch, data outside the
-repository, and which tests run in one process (`-n 2 --dist loadgroup`).
+"""What all tests share: strict JAX flags, cheap compilation, compiled programs, the slow switch,
+data outside the repository, and which tests run in one process (`-n 2 --dist loadgroup`).
 """
 
 import os
@@ -18,6 +18,13 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     # XLA says of each program that it was compiled for "+prefer-no-gather", which is no feature of
     # a processor but a hint to LLVM.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+# Tests compile much and compute little, so XLA optimises little. `.ci/run` repeats those that
+# compare with published numbers with full optimisation, as users have it.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+# PyTorch's and BLAS's threads spin while they wait: with a process on each core they take the time
+# that the others need.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402

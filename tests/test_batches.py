@@ -14,7 +14,7 @@ from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.training.batches import (
-    NOTHING,
+    NO_AUGMENT,
     Augment,
     _pauses,
     _simulation,
@@ -118,7 +118,9 @@ def places(images):
 # ---- What a batch holds
 
 
-@pytest.mark.parametrize("augment", [NOTHING, replace(NOTHING, flip=0.5, pauses=0.4, stay=0.5)])
+@pytest.mark.parametrize(
+    "augment", [NO_AUGMENT, replace(NO_AUGMENT, flip=0.5, pauses=0.4, stay=0.5)]
+)
 def test_batches_hold_what_slow_loops_find_in_the_files(noise, augment):
     seen, still, gaps = set(), 0, np.diff(times())
     for data in take(noise, 4, augment=augment, seed=3):
@@ -161,7 +163,7 @@ def test_batches_hold_what_slow_loops_find_in_the_files(noise, augment):
 
 @pytest.mark.parametrize("flip", [0.0, 0.5])
 def test_the_displacement_warps_each_image_onto_the_next(moving, flip):
-    data = take(moving, 2, augment=replace(NOTHING, flip=flip), batch=6)[1]
+    data = take(moving, 2, augment=replace(NO_AUGMENT, flip=flip), batch=6)[1]
     warped, _ = warp(data.images[:-1], data.displacement[1:])
     visible = data.visible[1:]
     errors = np.abs(np.asarray(warped) - data.images[1:])[visible]
@@ -185,9 +187,9 @@ def test_hot_pixels_stay_and_noise_does_not(noise):
     bare, hot, noisy = (
         take(noise, 3, chain=2, augment=augment)
         for augment in (
-            NOTHING,
-            replace(NOTHING, hot_pixels=0.5),
-            replace(NOTHING, voxel_noise=0.1),
+            NO_AUGMENT,
+            replace(NO_AUGMENT, hot_pixels=0.5),
+            replace(NO_AUGMENT, voxel_noise=0.1),
         )
     )
     added = [b.tensors - a.tensors for a, b in zip(bare, hot, strict=True)]
@@ -207,7 +209,7 @@ def test_hot_pixels_stay_and_noise_does_not(noise):
 
 
 def test_a_chain_goes_on_where_its_last_part_ended(noise):
-    pausing = replace(NOTHING, flip=0.5, pauses=0.3, stay=0.5)
+    pausing = replace(NO_AUGMENT, flip=0.5, pauses=0.3, stay=0.5)
     parts = take(noise, 6, chain=3, augment=pausing, seed=1)
     for chain in (parts[:3], parts[3:]):
         for b in range(BATCH):
@@ -220,14 +222,14 @@ def test_a_chain_goes_on_where_its_last_part_ended(noise):
 
 
 def test_each_file_has_its_turn_in_every_pass(noise):
-    for data in take(noise, 3, windows=IMAGES - 1, augment=NOTHING):
+    for data in take(noise, 3, windows=IMAGES - 1, augment=NO_AUGMENT):
         found = sorted(places(data.images[:, b])[0] for b in range(BATCH))
         assert found == [0, 1, 2]
 
 
 def test_without_flow_nothing_is_visible_but_in_pauses(tmp_path):
     file = write(tmp_path / "a.h5", random_events(0), moving_pictures(flow=False))
-    data = take([file], 2, augment=replace(NOTHING, pauses=0.5))[1]
+    data = take([file], 2, augment=replace(NO_AUGMENT, pauses=0.5))[1]
     assert not data.displacement.any()
     np.testing.assert_array_equal(data.visible.any((2, 3)), ~data.tensors.any((2, 3, 4)))
     assert data.visible.any()
@@ -235,7 +237,7 @@ def test_without_flow_nothing_is_visible_but_in_pauses(tmp_path):
 
 def test_a_window_without_events_and_a_file_without_any(tmp_path):
     file = write(tmp_path / "a.h5", Events.empty(), moving_pictures())
-    data = take([file], 1, augment=NOTHING)[0]
+    data = take([file], 1, augment=NO_AUGMENT)[0]
     assert not data.tensors.any() and data.images.any() and data.visible.any()
 
 
@@ -252,7 +254,7 @@ def test_sets_that_firenet_simulates(tmp_path, monkeypatch):
     dataset.run(Simulate(tmp_path / "set", sequences=2, validation=1, seconds=0.3,
                          sensor_size="24x20"))  # fmt: skip
     training, _ = split(tmp_path / "set")
-    for data in take(training, 4, augment=NOTHING):
+    for data in take(training, 4, augment=NO_AUGMENT):
         assert data.tensors.any() and 0 <= data.images.min() < data.images.max() <= 1
         warped, _ = warp(data.images[:-1], data.displacement[1:])
         errors = np.abs(np.asarray(warped) - data.images[1:])[data.visible[1:]]
@@ -371,7 +373,7 @@ def test_pictures_and_flow_of_other_sizes_are_said(tmp_path):
             attributes, values = dict(whole.attrs), whole[..., 1:]
             del file[f"{name}000000007"]
             file.create_dataset(f"{name}000000007", data=values).attrs.update(attributes)
-        message = refused(path, windows=IMAGES - 1, augment=NOTHING)
+        message = refused(path, windows=IMAGES - 1, augment=NO_AUGMENT)
         assert "000000007: has the shape" in message and expected in message
 
 
@@ -394,7 +396,7 @@ def test_crops_and_windows_reach_to_the_end(noise):
     assert take(noise, 1, crop=HEIGHT)[0].images.shape[2:] == (HEIGHT, HEIGHT)
     first = {
         int(places(data.images[:, b])[1][0])
-        for data in take(noise, 4, windows=IMAGES - 2, augment=NOTHING)
+        for data in take(noise, 4, windows=IMAGES - 2, augment=NO_AUGMENT)
         for b in range(BATCH)
     }
     assert first == {1, 2}
@@ -403,5 +405,5 @@ def test_crops_and_windows_reach_to_the_end(noise):
 def test_long_files_have_as_many_turns_as_they_have_windows_for(tmp_path, noise):
     pictures = itertools.islice(noise_pictures(1), WINDOWS + 1)
     short = write(tmp_path / "short.h5", random_events(1), pictures)
-    for data in take([noise[0], short], 2, batch=4, augment=NOTHING):  # 12 and 4 windows
+    for data in take([noise[0], short], 2, batch=4, augment=NO_AUGMENT):  # 12 and 4 windows
         assert sorted(places(data.images[:, b])[0] for b in range(4)) == [0, 0, 0, 1]

@@ -495,7 +495,7 @@ def test_training_and_validation_choose_from_other_textures(tmp_path, monkeypatc
         chosen.add(args[-1])  # the seed
         return made
 
-    monkeypatch.setattr(dataset, "POOL", 2)
+    monkeypatch.setattr(dataset, "SEQUENCES_PER_POOL", 2)
     monkeypatch.setattr(dataset, "load_textures", drawn)
     monkeypatch.setattr(dataset, "write_sequence", lambda path, *_, **__: path.touch() or 0)
     monkeypatch.setattr(dataset, "sequence", lambda key, textures, *_: ((), ()))

@@ -476,7 +476,7 @@ def test_lpips_where_files_are_named_and_pictures_large_enough(folder, tmp_path,
     found = run(settings(folder, tmp_path / "small", **choices))
     entry = found["sequences"]["a"]["methods"]["hf"]
     assert entry["means"]["lpips"] is None and entry["gaps"]["lpips"] == "pictures too small"
-    monkeypatch.setattr(evaluate.lpips, "SMALLEST", HEIGHT)
+    monkeypatch.setattr(evaluate.lpips, "MIN_SIDE", HEIGHT)
     entry = run(settings(folder, tmp_path / "out", **choices))["sequences"]["a"]["methods"]["hf"]
     assert entry["values"]["lpips"] == entry["values"]["mse"] and "lpips" not in entry["gaps"]
 
@@ -675,7 +675,7 @@ def test_temporal_errors_do_not_depend_on_where_batches_end(folder, tmp_path, mo
     path, values = write(tmp_path / "a.h5", 8), []
     for batch in (8, 3):
         for module in (evaluate, comparison):
-            monkeypatch.setattr(module, "BATCH", batch)
+            monkeypatch.setattr(module, "IMAGES_AT_ONCE", batch)
         choices = {"data": (path,), "methods": "hf"}
         results = run(settings(folder, tmp_path / f"{batch}", **choices))
         values.append(results["sequences"]["a"]["methods"]["hf"]["values"]["temporal_error"])

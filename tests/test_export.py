@@ -102,7 +102,7 @@ def test_onnx_without_normalisation_takes_any_weights():
 
 # ---- StableHLO
 
-ELSEWHERE = """
+WITHOUT_PACKAGE = """
 import sys
 import jax, numpy as np
 step = jax.jit(jax.export.deserialize(open(sys.argv[1], "rb").read()).call)
@@ -129,7 +129,7 @@ def test_stablehlo_runs_where_the_package_is_not_imported(tmp_path):
     np.savez(tmp_path / "in.npz", **tensors)
     names = [str(tmp_path / name) for name in ("model.stablehlo", "in.npz", "out.npz")]
     done = subprocess.run(
-        [sys.executable, "-c", ELSEWHERE, *names], capture_output=True, text=True, timeout=900
+        [sys.executable, "-c", WITHOUT_PACKAGE, *names], capture_output=True, text=True, timeout=900
     )
     assert done.returncode == 0, done.stderr[-2000:]
     found = np.load(tmp_path / "out.npz")

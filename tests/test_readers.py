@@ -456,7 +456,7 @@ def test_ecd_of_enormous_parts(tmp_path, monkeypatch):
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 5)
     with pytest.raises(RecordingError, match="a.png: cannot be read .*bomb"):
         open_recording(folder, (3, 4)).frames.read(0)
-    monkeypatch.setattr(ecd, "MOST", 30)
+    monkeypatch.setattr(ecd, "MAX_BYTES", 30)
     refused(folder, "images.txt: is larger than")
 
 

@@ -180,7 +180,7 @@ def test_ssim_where_is_the_mean_of_the_map_there():
 @pytest.mark.parametrize("warm", [10_000_000, 55_000])
 def test_the_end_is_judged_as_reconstruct_shows_it(folder, monkeypatch, warm):
     """Against the public functions, from the first window or from a later one on."""
-    monkeypatch.setattr(train, "WARM", warm)
+    monkeypatch.setattr(train, "WARM_UP", warm)
     weights = Weights(initial_params(jax.random.key(1)), True)
     one = train.cut_off(folder, 5)  # frames 15 to 19 are judged
     begin = max(0, one.end - -(-warm // EVERY) + (warm % EVERY > 0))

@@ -12,7 +12,7 @@ from test_pipeline import write_recording
 
 from firenet_jax import cli
 from firenet_jax.storage.files import OutputError
-from firenet_jax.storage.screen import BETWEEN, SMALLEST, Screen
+from firenet_jax.storage.screen import MIN_INTERVAL, MIN_WIDTH, Screen
 
 
 class TclError(Exception):
@@ -67,7 +67,7 @@ shown = []
 @pytest.fixture
 def display(monkeypatch):
     """The clock goes on by `clock.step` with each look at it."""
-    clock = types.SimpleNamespace(now=0.0, step=2 * BETWEEN)
+    clock = types.SimpleNamespace(now=0.0, step=2 * MIN_INTERVAL)
 
     def monotonic():
         clock.now += clock.step
@@ -87,7 +87,7 @@ def test_shows_greys_and_colours_as_they_are(display):
         picture = rng.integers(0, 256, shape, np.uint8)
         screen.show(picture, "a.mp4")
         np.testing.assert_array_equal(shown[-1].pixels, picture)
-        assert shown[-1].factor * shape[1] >= SMALLEST
+        assert shown[-1].factor * shape[1] >= MIN_WIDTH
     assert screen.window.titles == ["a.mp4"] * 3 and screen.window.updates == 3
     display.step = 0  # no time passes: the next one comes too early
     screen.show(picture, "a.mp4")

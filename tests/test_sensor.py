@@ -16,7 +16,7 @@ from firenet_jax.simulation.scenes import SceneSettings, rendering_times, video
 from firenet_jax.simulation.sensor import (
     EPS,
     FAULTY,
-    LONGEST,
+    MAX_INTERVAL,
     TICKS,
     Sensor,
     SensorSettings,
@@ -200,7 +200,7 @@ def test_events_of_an_interval_lie_in_it_and_all_are_sorted():
 
 def test_times_that_do_not_advance_are_refused():
     image = np.full((2, 2), 0.5, np.float32)
-    for second in (5, 4, 6 + LONGEST):
+    for second in (5, 4, 6 + MAX_INTERVAL):
         with pytest.raises(ValueError, match="renderings at 5"):
             list(event_list(plain_sensor(), [(5, image), (second, image)]))
 

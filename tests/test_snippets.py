@@ -1,7 +1,7 @@
 """Every command of README and the site is understood; with --slow, each of them and all code run.
 
 They run on stand-ins of the files that they name, made small: a line of `SMALLER` says how. What
-cannot run in a test is in `ELSEWHERE`, with the reason.
+cannot run in a test is in `NOT_RUN`, with the reason.
 """
 
 import importlib
@@ -32,7 +32,7 @@ SMALLER = {
     "evaluate": "--warm-up 0.2",
     "reconstruct a.zip -o part.mp4": "--start 0.1 --stop 0.3",
 }
-ELSEWHERE = {
+NOT_RUN = {
     "firenet live": "serves a page until it is told to stop: test_live.py",
     "firenet reconstruct RECORDING -o video.mp4 --show": "needs a screen: test_screen.py",
     "firenet export --web": "needs onnxruntime-web of npm: test_web_page.py",
@@ -167,8 +167,8 @@ def runnable():
     """Each command once; what cannot run is named, and is still there."""
     here = [command for page, command in EVERY if page.name != "launchers.md"]  # of clusters
     every = sorted({command.partition("  #")[0].strip() for command in here})
-    left = {command for command in every for start in ELSEWHERE if command.startswith(start)}
-    assert all(any(one.startswith(start) for one in left) for start in ELSEWHERE)
+    left = {command for command in every for start in NOT_RUN if command.startswith(start)}
+    assert all(any(one.startswith(start) for one in left) for start in NOT_RUN)
     return [one for one in every if one not in left]
 
 

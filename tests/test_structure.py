@@ -30,7 +30,7 @@ LAYERS = [
 ]
 # Each outside library enters by one door.
 DOORS = {
-    "flax": {"network", "evaluation.baselines"}, "optax": {"training.step"},
+    "flax": {"network", "checkpoint", "evaluation.baselines"}, "optax": {"training.step"},
     "orbax": {"training.run"}, "torch": set(), "av": {"storage.video", "commands.simulate"},
     "h5py": {"readers", "training.batches", "commands.simulate", "storage.arrays"},
     "pyarrow": {"readers"}, "grain": {"training.batches"}, "faery": {"readers"},

@@ -1,7 +1,7 @@
-"""Random scene -> events -> reconstruction -> video beside the truth: a trial without a recording.
+"""Random scene -> events -> reconstruction -> video with the truth: a demo without a recording.
 
-Everything between the photographs and the pictures runs on the device, a few windows at a time;
-memory does not grow with the demo's length. The numbers printed compare the network's images,
+Everything between the photographs and the pictures runs on the device, a few windows at a time, so
+memory does not grow with the demo's length. The printed metrics compare the network's images,
 clipped to [0, 1], with the truth at each window's end, after the state has warmed up.
 """
 
@@ -31,7 +31,7 @@ from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import bar
 from firenet_jax.storage.video import check_output, followed, open_writer
 
-WINDOWS = 10  # simulated and reconstructed at once
+WINDOWS_AT_ONCE = 10  # simulated and reconstructed at once
 RENDERINGS = 5  # in a window, with at most half a pixel of motion between two
 WARM_UP = 10  # windows from a zero state that the numbers leave out
 CAPTION = 16  # pixels above the pictures
@@ -39,7 +39,7 @@ CAPTION = 16  # pixels above the pictures
 
 @dataclass(frozen=True)
 class Demo:
-    """Simulate a moving scene, reconstruct it from its events, and show both side by side.
+    """Simulate a moving scene and reconstruct it from its events: both side by side.
 
     Examples:
       firenet demo -o demo.mp4
@@ -48,22 +48,22 @@ class Demo:
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """A name that ends in .mp4 or .gif, or a folder for png files: events (blue: brighter, red:
-    darker), reconstruction and truth, at natural speed."""
+    darker), reconstruction and truth, in real time."""
     weights: Annotated[Path | None, tyro.conf.arg(aliases=["-c"])] = None
-    """Weights: .npz, a published PyTorch checkpoint, or the folder of a training run. Without:
-    those that come with the package."""
+    """Weights: .npz, a published PyTorch checkpoint, or the folder of a training run. Default: the
+    built-in weights."""
     seconds: float = 3.0
-    """How long the scene lasts."""
+    """Duration of the scene."""
     fps: float = 30.0
-    """Pictures per second; each is made of the events since the last."""
+    """Pictures per second; each is reconstructed from the events since the last."""
     seed: int = 0
-    """Other numbers give other scenes."""
+    """Random seed of the scene."""
     sensor_size: str = "240x180"
     """WIDTHxHEIGHT of the simulated sensor."""
     faults: bool = False
-    """What real sensors have: mismatch, noise, leak, hot pixels, finite bandwidth."""
+    """Simulate the faults of real sensors: mismatch, noise, leak, hot pixels, finite bandwidth."""
     overwrite: bool = False
-    """Replace an output that exists."""
+    """Replace an existing output."""
 
     def __post_init__(self):
         if not 0 < self.seconds <= 60:
@@ -134,8 +134,8 @@ def make_scene(settings: Demo, height: int, width: int) -> tuple[Sensor, Scene]:
     """One sensor and one scene, each with a leading axis of 1. The fastest point moves as fast as
     the renderings of a window allow, which suits the network too."""
     scene_key, sensor_key = jax.random.split(jax.random.key(settings.seed))
-    # Photographs show best what a reconstruction is worth, those that no network here trained on.
-    # Of those held out the ones that everybody has: the same seed is the same scene everywhere.
+    # Photographs that no network here was trained on. Of the held-out ones only those that every
+    # installation has, so that a seed gives the same scene on all machines.
     pictures = photographs({"skimage/data": HELD_OUT["skimage/data"]})
     textures = load_textures(pictures, count=16, size=320, seed=settings.seed)
     scene = random_scene(
@@ -163,8 +163,8 @@ def pictures(
     for `count` windows of `period` microseconds."""
     state = initial_state(1, height, width)
     sensor_state = last = None
-    for start in range(0, count, WINDOWS):
-        bounds = np.round(np.arange(start, start + WINDOWS + 1) * period).astype(np.int32)
+    for start in range(0, count, WINDOWS_AT_ONCE):
+        bounds = np.round(np.arange(start, start + WINDOWS_AT_ONCE + 1) * period).astype(np.int32)
         sensor_state, simulated = simulate(
             sensor, scene, bounds[:, None], sensor_state,
             height=height, width=width, renderings=RENDERINGS,
@@ -175,7 +175,7 @@ def pictures(
             last = images[0], simulated.images[0, 0]
         last, shown = _show(simulated, images, last)
         shown = jax.device_get(shown)
-        for t in range(min(WINDOWS, count - start)):
+        for t in range(min(WINDOWS_AT_ONCE, count - start)):
             greys = [np.stack([grey[t]] * 3, -1) for grey in (shown.images, shown.truth)]
             yield np.concatenate([shown.events[t], *greys], 1), shown.errors[t]
 

@@ -1,19 +1,18 @@
 """Methods x sequences -> table, JSON, CSV and a report: how close images come to camera frames.
 
-The protocol is EVREAL's for the paper's data: window i holds the events between frames i-1 and i;
-reconstruction begins 10 s before the part that counts; a prediction, which has the time of its
-window's last event, counts if that is within 1 ms of a frame (a window without events has the time
-of its end). With --between-frames, --rate, --at or --triggers images are looks at these times, the
-state advancing by windows of a size (instants.py). Frames and predictions are compared as (H, W)
-float32, clipped to 0 to 1, after histogram equalisation where it is asked for. Options vary each of
-these.
+The protocol is EVREAL's for the paper's data. Window i holds the events between frames i-1 and i.
+Reconstruction begins 10 s before the part that counts. A prediction has the time of its window's
+last event (of its end, if the window is empty) and counts if that is within 1 ms of a frame. With
+--between-frames, --rate, --at or --triggers images are looks at these times, while the state
+advances by windows of fixed size (instants.py). Frames and predictions are compared as (H, W)
+float32, clipped to 0 to 1, optionally after histogram equalisation. Options change each of these.
 
-    OUTPUT/results/SEQUENCE/METHOD.json     what is written when one method has seen one sequence
+    OUTPUT/results/SEQUENCE/METHOD.json     written when one method has finished one sequence
     OUTPUT/results/SEQUENCE/METHOD.npz      some of its pictures
-    OUTPUT/table.csv, results.json, index.html, videos/SEQUENCE.mp4       from all of those
+    OUTPUT/table.csv, results.json, index.html, videos/SEQUENCE.mp4       made from all of those
 
-A file of results appears when it is whole, and a run that was interrupted goes on with the others.
-What cannot be measured is a named gap: null and a reason, never a NaN.
+Results appear under their names when they are complete, so an interrupted run resumes with the
+others. A metric that cannot be computed is null, with a reason, never NaN.
 """
 
 import copy
@@ -39,7 +38,7 @@ from firenet_jax.commands.times import Times, read_times, times_of
 from firenet_jax.errors import OutputError, RecordingError, SettingsError, logger
 from firenet_jax.evaluation import lpips, report
 from firenet_jax.evaluation.comparison import (
-    BATCH,
+    IMAGES_AT_ONCE,
     Comparison,
     Gap,
     Measurements,
@@ -49,7 +48,7 @@ from firenet_jax.evaluation.comparison import (
     to_8_bit,
 )
 from firenet_jax.evaluation.equalise import Kind, equalise
-from firenet_jax.evaluation.methods import NAMES, Method, Missing, digest, load, look
+from firenet_jax.evaluation.methods import METHODS, Method, Missing, digest, load, look
 from firenet_jax.evaluation.results import METRICS, Measured, mean, summary
 from firenet_jax.events import Frames, Recording
 from firenet_jax.filters import check_span
@@ -74,15 +73,15 @@ CUTS = {
     "shapes_6dof": (5.0, 20.0),
     "slider_depth": (1.0, 2.5),
 }
-# which can hold frames
+# Formats that can hold frames.
 SUFFIXES = (".h5", ".hdf5", ".hdf", ".zip", ".bag", ".mcap", ".aedat", ".aedat4")
-SMALLEST = 17  # pixels of a side: what CW-SSIM's filters need
-WIDEST = 2000  # pixels of a video
+MIN_SIDE = 17  # pixels of a side: what CW-SSIM's filters need
+MAX_VIDEO_WIDTH = 2000  # pixels
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Compare methods with the frames of recordings: a table, JSON, CSV and a report to look at.
+    """Compare reconstructions with the frames of recordings: a table, JSON, CSV and an HTML report.
 
     Examples:
       firenet evaluate dynamic_6dof.zip boxes_6dof.zip -o report/
@@ -97,49 +96,50 @@ class Evaluate:
     """Recordings with frames: ECD folders, zips and bags, HDF5 (HQF, MVSEC, our own), EVREAL
     folders; or folders of such recordings."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """A folder, for index.html, table.csv and results.json. An evaluation that was interrupted
-    goes on there, and one with more data or methods uses what is there."""
+    """A folder for index.html, table.csv and results.json. An interrupted evaluation is resumed,
+    and one with more data or methods reuses earlier results."""
     methods: str | None = None
-    """Of firenet, e2vid, hf (high-pass filter) and mr (manifold regularisation), with commas.
-    Without: all, e2vid only with weights."""
+    """Comma-separated: firenet, e2vid, hf (high-pass filter), mr (manifold regularisation).
+    Default: all, e2vid only if its weights are given."""
     weights: Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-c"])] = ()
-    """Weights of FireNet or FireNet+: each file is a method named after it. Without any: those
-    that come with the package, which are named built-in."""
+    """Weights of FireNet or FireNet+; each file is a method named after it. Default: the built-in
+    weights."""
     e2vid_weights: Path | None = None
     """E2VID's published checkpoint, or E2VID+'s."""
     e2vid_sigmoid: bool = True
-    """--no-e2vid-sigmoid for E2VID+, whose images pass no sigmoid."""
+    """--no-e2vid-sigmoid for E2VID+, which has no sigmoid at its end."""
     e2vid_random: bool = False
     """Run E2VID with random weights, to measure its time."""
     events: Annotated[int | None, tyro.conf.arg(aliases=["-N"])] = None
-    """Windows of this many events instead of those between frames; with images at given times, of
-    what the state takes in."""
+    """Windows of this many events instead of windows between frames. With images at given times:
+    the windows that update the state."""
     duration: Annotated[float | None, tyro.conf.arg(aliases=["-T"])] = None
-    """Windows of this many milliseconds, likewise. With images at given times and neither: 0.35
-    events per pixel, at most 40 ms."""
+    """Windows of this many milliseconds, likewise. Default with images at given times: 0.35 events
+    per pixel, at most 40 ms."""
     times: Times = Times()
     keep_ratio: float = 1.0
-    """Use only this share of the frames, drawn at random: windows between them get longer and
-    uneven."""
+    """Use only this share of the frames, drawn at random, so that windows between them become
+    longer and uneven."""
     seed: int = 0
-    """Another number draws other frames."""
+    """Random seed of the choice of frames."""
     start: float | None = None
-    """Count frames from this many seconds after the beginning (the first event or frame). For
-    recordings named as the Event Camera Dataset's the paper's interval is the default."""
+    """Count frames from this many seconds after the beginning (the first event or frame). Default
+    for recordings named like those of the Event Camera Dataset: the paper's interval."""
     stop: float | None = None
     """Count frames up to this many seconds after the beginning."""
     warm_up: float = 10.0
     """Begin to reconstruct this many seconds before the first frame that counts."""
     tolerance: float = 1.0
-    """A prediction counts if it is at most so many milliseconds from a frame."""
+    """A prediction counts if it is within this many milliseconds of a frame."""
     equalise: Kind = "none"
-    """Histogram equalisation of images and frames before they are compared."""
+    """Histogram equalisation of images and frames before comparison."""
     lpips: tuple[Path, Path] | None = None
-    """LPIPS, by two files: torchvision's AlexNet or SqueezeNet, and its linear layers."""
+    """Compute LPIPS from two files: torchvision's AlexNet or SqueezeNet, and LPIPS's linear
+    layers."""
     sensor_size: str | None = None
-    """WIDTHxHEIGHT of the sensor, such as 240x180, where the recordings do not say it."""
+    """WIDTHxHEIGHT of the sensor, such as 240x180, if the recordings do not state it."""
     overwrite: bool = False
-    """Compute again what an evaluation with other settings left in the output folder."""
+    """Recompute results that an evaluation with other settings left in the output folder."""
 
     def __post_init__(self):
         if not self.data:
@@ -147,7 +147,7 @@ class Evaluate:
                 "no data: name one or more recordings, or folders of them, before the options"
             )
         if not self.method_names:
-            raise SettingsError(f"no methods: choose from {', '.join(NAMES)}")
+            raise SettingsError(f"no methods: choose from {', '.join(METHODS)}")
         Windows(events=self.events, duration=self.duration)  # refuses numbers that cannot be
         if not 0 < self.keep_ratio <= 1:
             raise SettingsError(f"keep ratio is {self.keep_ratio}, but is a share, 0 to 1")
@@ -307,7 +307,7 @@ def plan(name: str, recording: Recording, settings: Evaluate) -> Plan:
         raise Gap(
             f"frames are {width}x{height}, the sensor is {recording.width}x{recording.height}"
         )
-    if min(height, width) < SMALLEST:
+    if min(height, width) < MIN_SIDE:
         raise Gap(f"{width}x{height} pixels are too small to be compared")
     times = np.asarray(frames.times, np.int64)
     if (np.diff(times) < 0).any():
@@ -453,7 +453,7 @@ def evaluate(
                 if truth.shape != image.shape:
                     raise Gap(f"frame {plan.numbers[place] + 1} is of another size: {truth.shape}")
                 waiting.append(Comparison(place, image, truth, displacement(plan, place)))
-            if len(waiting) == BATCH:
+            if len(waiting) == IMAGES_AT_ONCE:
                 pictures.add(waiting, found.add(waiting))
                 waiting = []
         if waiting:
@@ -667,7 +667,7 @@ def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
         path = settings.output / "videos" / f"{plan.name}.mp4"
         path.parent.mkdir(exist_ok=True)
         step = np.median(np.diff([int(times[number]) for number, _ in clip])) / 1e6
-        coarser = -(-len(clip[0][1]) * plan.recording.width // WIDEST)
+        coarser = -(-len(clip[0][1]) * plan.recording.width // MAX_VIDEO_WIDTH)
         rows = (
             np.concatenate([report.in_colours(image) for image in images], 1)[::coarser, ::coarser]
             for _, images in clip

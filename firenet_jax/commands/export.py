@@ -27,11 +27,11 @@ KINDS = ".onnx", ".stablehlo", ".pth", ".safetensors"
 
 @dataclass(frozen=True)
 class Export:
-    """Write weights as a file that other programs run or load.
+    """Write the network or its weights in a format of other programs.
 
-    .onnx is the network for onnxruntime, TensorRT, OpenVINO and browsers; .stablehlo for a process
-    with jax alone; .pth for rpg_e2vid, EVREAL and other programs in PyTorch; .safetensors the same
-    tensors, which many libraries read. onnx, safetensors and flatbuffers are the extra `export`.
+    .onnx is the network for onnxruntime, TensorRT, OpenVINO and browsers; .stablehlo the network
+    for jax without this package; .pth the weights for rpg_e2vid, EVREAL and other PyTorch programs;
+    .safetensors the same weights for other libraries. This needs the extra `export`.
 
     Examples:
       firenet export -o firenet.onnx --picture
@@ -44,17 +44,18 @@ class Export:
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """A name that ends in .onnx, .stablehlo, .pth or .safetensors."""
     normalise: bool = True
-    """.onnx and .stablehlo: normalise event tensors inside, if the weights ask for it."""
+    """Without --no-normalise, .onnx and .stablehlo normalise event tensors if the weights expect
+    it."""
     picture: bool = False
-    """.onnx and .stablehlo: give the sharpened 8-bit picture too."""
+    """.onnx and .stablehlo: also output the sharpened 8-bit picture."""
     web: Path | None = None
-    """Folder of a web page to write: a recording dropped onto it becomes video in the browser."""
+    """Write a web page into this folder that reconstructs recordings dropped onto it."""
     runtime: Path = Path("node_modules") / RUNTIME
-    """--web: folder of onnxruntime-web, where `npm install onnxruntime-web` has put it."""
+    """--web: folder of onnxruntime-web, as installed by `npm install onnxruntime-web`."""
     sample: Path | None = None
-    """--web: recording whose first seconds the page begins with; else a simulated one."""
+    """--web: recording that the page starts with (its first seconds). Default: a simulated one."""
     overwrite: bool = False
-    """Replace an output that exists."""
+    """Replace an existing output."""
 
 
 SAMPLE = 500_000  # events: some seconds, one or two megabytes

@@ -1,14 +1,13 @@
 """Jobs (a recording, its output) -> pictures on disk: reading, device and writing overlapped.
 
-    read      jobs -> chunks of T x B steps: recordings of one sensor size run side by side in B
-              slots, each with its own state; a slot whose recording has ended takes the next
+    read      jobs -> chunks of T x B steps: recordings of one sensor size run in B slots, each
+              with its own state; when a recording ends, its slot takes the next one
     compute   chunks -> pictures, by the compiled program `reconstruction.events_to_pictures`; the
               devices of a process share the slots
-    write     pictures -> their outputs, and what the next run needs should this one be interrupted
+    write     pictures -> outputs, and positions from which an interrupted run can resume
 
-Each stage is a thread that is one chunk ahead, so memory holds a few chunks, whatever the length
-of the recordings. A recording that turns out to be damaged does not keep the others from being
-done.
+Each stage is a thread that runs one chunk ahead, so memory holds a few chunks, whatever the length
+of the recordings. A damaged recording does not stop the others.
 """
 
 import copy
@@ -46,11 +45,11 @@ from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import Bytes
 from firenet_jax.storage.screen import Screen
 from firenet_jax.storage.video import FolderWriter, VideoWriter
-from firenet_jax.tensors import IN_LISTS, Packed, pack_for_devices
+from firenet_jax.tensors import PACKED_SPECS, Packed, pack_for_devices
 from firenet_jax.windows import Windows, cut
 
 Writer = FolderWriter | VideoWriter | ArraysWriter | BagWriter
-RESUME_EVERY = 5.0  # seconds between two positions that are kept for a run that goes on
+RESUME_EVERY = 5.0  # seconds between two positions to resume from
 
 
 class Job(NamedTuple):
@@ -58,9 +57,9 @@ class Job(NamedTuple):
 
     recording: Recording
     output: Path
-    record: dict  # all that the pictures depend on; a run that goes on must have the same
+    record: dict  # everything that the pictures depend on; a resumed run must have the same
     windows: Windows
-    times: np.ndarray | Grid | None  # of the images; None: one for each window
+    times: np.ndarray | Grid | None  # of the images; None: one per window
     events: Callable[[], Iterator[Events]]  # after all filters
     writer: Callable[[], Writer]  # opens the output
 
@@ -71,26 +70,26 @@ class Way(NamedTuple):
     network: Network = Network()
     display: Display = Display()
     preview: bool = False
-    raw: bool = False  # images as the network gives them
-    at_times: bool = False  # not one for each window
-    chunk: int | None = None  # steps a recording gives the device at once; None: `chunk_for`
-    batch: int | None = None  # slots; None: one for each device
-    several: bool = False  # of several outputs, those that are whole are noted down
+    raw: bool = False  # write the network's float32 images
+    at_times: bool = False  # images at given times
+    chunk: int | None = None  # steps of a recording per call of the device; None: `chunk_for`
+    batch: int | None = None  # slots; None: one per device
+    several: bool = False  # there are several outputs: finished ones are recorded
     overwrite: bool = False
 
 
 class Done(NamedTuple):
-    """What this run has made of a job."""
+    """The result of a finished job."""
 
     job: Job
     pictures: int
     events: int
-    slower: float | None  # than reality, of a video
+    slower: float | None  # by how much a video is slower than real time
 
 
 @dataclass
 class Outcome:
-    """What became of the jobs, by their output."""
+    """The finished and the failed jobs, by output."""
 
     done: dict[Path, Done] = field(default_factory=dict)
     failed: dict[Path, RecordingError] = field(default_factory=dict)
@@ -251,8 +250,8 @@ def in_chunks(
 
 
 def chunk_for(pixels: int) -> int:
-    """Windows that a device takes at once, where nothing is asked: what a chunk costs by itself is
-    shared by more, but they take more memory."""
+    """The default number of windows per chunk: larger chunks have less overhead, but take more
+    memory."""
     if jax.default_backend() != "cpu":
         return 16
     return 8 if pixels <= 2**16 else 4
@@ -260,7 +259,7 @@ def chunk_for(pixels: int) -> int:
 
 def start(job: Job, way: Way, opened: dict[Path, Writer]) -> tuple[Running, Session]:
     """Opens the stream of a job's steps, after those that an interrupted run has finished."""
-    # First of all, as it keeps other runs from what is read and removed here.
+    # The writer first: its lock keeps other runs from the files that are read and removed here.
     writer = opened[job.output] = job.writer()
     running = Running(job, writer)
     try:
@@ -342,7 +341,7 @@ def computed(
         if mesh:
             session = jax.device_put(session, sharding(BATCH, mesh))
             events = jax.tree.map(
-                lambda a, spec: jax.device_put(a, sharding(spec, mesh)), events, IN_LISTS
+                lambda a, spec: jax.device_put(a, sharding(spec, mesh)), events, PACKED_SPECS
             )
         session, shown = events_to_pictures(
             weights, session, events, chunk.valid, chunk.looks, height=height, width=width,

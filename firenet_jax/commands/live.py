@@ -1,4 +1,4 @@
-"""Events as they come -> pictures at once, on a page of this machine."""
+"""Live events -> live pictures on a local web page."""
 
 import json
 import sys
@@ -21,15 +21,16 @@ from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
 from firenet_jax.settings import parse_size
 from firenet_jax.storage.screen import Screen
-from firenet_jax.windows import LONGEST, Windows
+from firenet_jax.windows import DEFAULT_LONGEST, Windows
 
 
 @dataclass(frozen=True)
 class Live:
     """Watch a camera, a stream of events, or a recording as if it came from a camera.
 
-    Prints the address of a page: the events, the reconstruction, event rate, latency. When more
-    events come than this machine works off, whole windows are dropped and counted.
+    Prints the address of a local web page with the events, the reconstruction, the event rate and
+    the latency. If more events arrive than this machine can process, whole windows are dropped and
+    counted.
 
     Examples:
       firenet live recording.aedat4 --replay
@@ -39,32 +40,33 @@ class Live:
     """
 
     source: tyro.conf.Positional[str]
-    """camera; udp://HOST:PORT to listen at; tcp://HOST:PORT to connect to; - for standard input; a
+    """camera; udp://HOST:PORT to listen on; tcp://HOST:PORT to connect to; - for standard input; a
     file that another program writes; or with --replay a recording of any format."""
     replay: bool = False
-    """Play a recording at its own speed."""
+    """Play a recording in real time."""
     speed: float = 1.0
-    """Play it so many times as fast."""
+    """With --replay: playback speed, 2 is twice as fast."""
     repeat: int = 1
-    """Play it so many times."""
+    """With --replay: how often to play it."""
     weights: Annotated[str | None, tyro.conf.arg(aliases=["-c"])] = None
     """Weights of `firenet train` or a PyTorch checkpoint (default: built-in)."""
     sensor_size: str | None = None
-    """WIDTHxHEIGHT of the sensor; streams do not say it."""
+    """WIDTHxHEIGHT of the sensor, which streams do not state."""
     wire: Literal["t64_x16_y16_on8", "t32_x16_y15_on1", "text"] = "t64_x16_y16_on8"
-    """How a stream writes an event: 13 bytes, 8 bytes (both as faery sends them), or a line."""
+    """Wire format of a stream: 13 or 8 bytes per event (both as faery sends them), or a line of
+    text."""
     events_per_pixel: float = 0.35
-    """Events of a window, per pixel of the sensor."""
-    longest: float = LONGEST
-    """A window lasts so many milliseconds at most."""
+    """Events per window and pixel of the sensor."""
+    longest: float = DEFAULT_LONGEST
+    """Longest duration of a window in milliseconds."""
     behind: int = 2
-    """Windows that may wait; of more the oldest is dropped."""
+    """How many windows may wait; if there are more, the oldest is dropped."""
     port: int = 8765
-    """Of the page, on 127.0.0.1; 0: any that is free."""
+    """Port of the page, on 127.0.0.1; 0: any free port."""
     show: bool = False
-    """Open a window beside the page."""
+    """Also open a window."""
     seconds: float | None = None
-    """End after so long."""
+    """End after this many seconds."""
     display: Display = Display()
 
     def __post_init__(self):

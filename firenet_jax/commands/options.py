@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import docstring_parser
 import tyro
 
-WORDS = {Path: "PATH", str: "TEXT", int: "NUMBER", float: "NUMBER", ...: "..."}
+METAVARS = {Path: "PATH", str: "TEXT", int: "NUMBER", float: "NUMBER", ...: "..."}
 POSITIONAL = typing.get_args(tyro.conf.Positional[int])[1]
 FURTHER = "further"  # options whose fields come after settings within the settings
 
@@ -81,8 +81,8 @@ def _plain(hint: Any, text: str, required: bool) -> Any:
         if typing.get_origin(inner) is typing.Literal:
             said["metavar"] = f"{{{','.join(typing.get_args(inner))}}}"
     parts = typing.get_args(inner) if typing.get_origin(inner) is tuple else (inner,)
-    if all(part in WORDS for part in parts):
-        said["metavar"] = " ".join(WORDS[part] for part in parts).replace(" ...", "...")
+    if all(part in METAVARS for part in parts):
+        said["metavar"] = " ".join(METAVARS[part] for part in parts).replace(" ...", "...")
     return Annotated[kind, tyro.conf.arg(**said), *extras]
 
 

@@ -1,6 +1,6 @@
-"""Recordings -> pictures on disk: the settings, the jobs that they ask for, the last line.
+"""Recordings -> pictures on disk: the settings, the jobs made of them, the summary.
 
-How a job is done is in `jobs`; how an interrupted run goes on, in `storage.resume`.
+`jobs` does the work; `storage.resume` resumes an interrupted run.
 """
 
 import dataclasses
@@ -45,12 +45,12 @@ from firenet_jax.storage.video import (
     followed,
     open_writer,
 )
-from firenet_jax.windows import LONGEST, Windows, in_words, usual
+from firenet_jax.windows import DEFAULT_LONGEST, Windows, in_words, usual
 
-# Settings that the pictures do not depend on (on the chunk only in float32's last bits), or that
-# are told in another way.
-ELSEWHERE = ("recordings", "output", "weights", "fps", "speed", "chunk", "batch", "overwrite")
-ELSEWHERE += ("columns", "strict", "processes", "process", "show")
+# Settings that are not part of a run's record: the pictures do not depend on them (on the chunk
+# only in float32's last bits), or the record holds them in another form.
+UNRECORDED = ("recordings", "output", "weights", "fps", "speed", "chunk", "batch", "overwrite")
+UNRECORDED += ("columns", "strict", "processes", "process", "show")
 
 
 @dataclass(frozen=True)
@@ -72,58 +72,58 @@ class Reconstruct:
     """Text, zip, HDF5, ECD or EVREAL folder, .bin, .dat, .raw, .aedat, .aedat4, .es, ROS bag."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """A folder (png files and timestamps.txt), or a name that ends in .mp4, .gif, .h5 (float32
-    images), .bag or .ros2. Of several recordings one each, in the folder of that name."""
+    images), .bag or .ros2. Several recordings: one each, in a folder of that name."""
     weights: Annotated[Path | None, tyro.conf.arg(aliases=["-c"])] = None
-    """Weights: .npz, a published PyTorch checkpoint, or the folder of a training run. Without:
-    those that come with the package."""
+    """Weights: .npz, a published PyTorch checkpoint, or the folder of a training run. Default: the
+    built-in weights."""
     windows: Windows = Windows()
     times: Times = Times()
     display: Display = Display()
     network: Network = Network()
     preview: bool = False
-    """Show the events (blue: brighter, red: darker) beside the reconstruction."""
+    """Show the events (blue: brighter, red: darker) next to the reconstruction."""
     show: bool = False
-    """Show the pictures in a window, too, while they are made; with several recordings those of the
-    first that is not done."""
+    """Also show the pictures in a window while they are computed; with several recordings, those
+    of the first one that is not finished."""
     hot_pixels: str | None = None
     """Ignore these pixels: a file of `x,y` lines, or `auto` to find them in the recording."""
     flip: bool = False
-    """Turn the picture by 180 degrees."""
+    """Rotate the picture by 180 degrees."""
     start: float | None = None
     """Begin this many seconds after the first event."""
     stop: float | None = None
     """End this many seconds after the first event."""
     speed: float | None = None
-    """How fast a video plays: 1 is real time, 0.1 ten times slower. Without: real time, and slower
-    where a recording is so short that nobody could see it."""
+    """Playback speed of a video: 1 is real time, 0.1 ten times slower. Default: real time, but
+    slower if the recording is very short."""
     fps: float | None = None
-    """Show each picture of a video for as long, so many per second, whatever its time."""
+    """Show this many pictures of a video per second, each for the same duration."""
     names: Literal["number", "nanoseconds"] = "number"
-    """Name the png files of --rate, --at, --between-frames or --triggers by their time, as Kalibr
-    takes them."""
+    """With --rate, --at, --between-frames or --triggers: name png files by number or by time in
+    nanoseconds, as Kalibr expects."""
     topic: str = "/cam0/image_raw"
-    """Of the images in a bag."""
+    """Topic of the images in a bag."""
     frame_id: str = "cam0"
-    """The frame of coordinates that images in a bag name."""
+    """Coordinate frame of the images in a bag."""
     sensor_size: str | None = None
-    """WIDTHxHEIGHT of the sensor, such as 240x180, where the recording does not say it."""
+    """WIDTHxHEIGHT of the sensor, such as 240x180, if the recording does not state it."""
     columns: str | None = None
-    """Order of the columns of a text that has no line of names, such as x,y,p,t."""
+    """Order of the columns in a text without a header line, such as x,y,p,t."""
     strict: bool = False
-    """Refuse a recording with a bad row or damage, instead of leaving out what cannot be read (at
-    most one event in a thousand) and reading up to the damage."""
+    """Refuse a damaged recording. Without this, it is read up to the damage, and up to one invalid
+    row in a thousand is skipped."""
     chunk: int | None = None
-    """Windows a recording gives the device at once (default: 16; on a CPU 8 of a sensor of up to
-    65,536 pixels, 4 of larger ones)."""
+    """Windows of a recording per call of the device (default: 16; on a CPU 8 for sensors of up to
+    65,536 pixels, 4 for larger ones)."""
     batch: int | None = None
-    """Recordings that run side by side, shared by the devices (default: one for each device)."""
+    """Recordings that run at the same time, shared by the devices (default: one per device)."""
     overwrite: bool = False
-    """Replace an output that exists."""
+    """Replace an existing output."""
     processes: int | None = None
-    """How many processes, on this machine or on many, deal the recordings out among them; where
-    nothing is said, those that srun or mpirun has started."""
+    """Number of processes, on one or more machines, that share the recordings. Default: as set by
+    srun or mpirun."""
     process: int | None = None
-    """Which one this is, from 0."""
+    """Index of this process, from 0."""
 
     def __post_init__(self):
         if self.fps is not None:
@@ -157,21 +157,21 @@ class Reconstruct:
 
 
 def run(settings: Reconstruct) -> list[Path]:
-    """Does what the settings say; returns the outputs, of several processes those of this one.
+    """Reconstructs the recordings; returns the outputs of this process.
 
-    Raises RecordingError, CheckpointError, OutputError or ValueError, in one sentence."""
+    Raises RecordingError, CheckpointError, OutputError or SettingsError."""
     weights = load_weights(settings.weights)
     if settings.show:
         check_screen()
-    # Recordings have nothing to do with each other, so processes need not know of each other:
-    # as one of JAX's own processes, one that is done or dies would take the others with it.
+    # Recordings are independent, so the processes do not use jax.distributed: there, a process that
+    # ends or dies would stop the others.
     process, processes = share(settings.process, settings.processes)
     mine = slice(process, None, processes)
     planned = plan(settings.recordings, settings.output)
     outputs = planned[mine]
     if not outputs:
         return []
-    for output in outputs:  # before recordings are opened: some are read whole for their size
+    for output in outputs:  # before opening recordings: some are read whole to infer their size
         check_free(output)
         if not done_file(output).is_file():
             check_output(output, settings.overwrite)
@@ -195,7 +195,7 @@ def run(settings: Reconstruct) -> list[Path]:
 
 
 def do_all(jobs: list[Job], settings: Reconstruct, weights: Weights, outcome: Outcome) -> None:
-    """Jobs of any sensor sizes, under one bar."""
+    """Does jobs of any sensor sizes, with one progress bar."""
     way = Way(
         settings.network, settings.display, settings.preview, settings.output.suffix == ".h5",
         settings.times.wanted, settings.chunk, settings.batch, len(settings.recordings) > 1,
@@ -212,7 +212,7 @@ def do_all(jobs: list[Job], settings: Reconstruct, weights: Weights, outcome: Ou
 
 
 def by_sensor_size(jobs: list[Job]) -> list[list[Job]]:
-    """Only recordings of the same size can share a batch."""
+    """Groups the jobs, as only recordings of the same size can share a batch."""
     groups: dict[tuple[int, int], list[Job]] = {}
     for job in jobs:
         groups.setdefault((job.recording.height, job.recording.width), []).append(job)
@@ -223,7 +223,7 @@ def by_sensor_size(jobs: list[Job]) -> list[list[Job]]:
 
 
 def plan(recordings: tuple[Path, ...], output: Path) -> list[Path]:
-    """The name of each recording's output: `output` itself if there is only one recording."""
+    """The output of each recording: `output` itself if there is only one recording."""
     if len(recordings) == 1:
         return [followed(output)]
     stems = [_stem(named(path)) for path in recordings]
@@ -238,10 +238,8 @@ def plan(recordings: tuple[Path, ...], output: Path) -> list[Path]:
 
 
 def _stem(path: Path) -> str:
-    """The name without its suffix, nor with one before that: `a.txt.gz` -> `a`, `a.1.txt` -> `a.1`.
-
-    A folder may have a dot in its name.
-    """
+    """The name without its suffixes: `a.txt.gz` -> `a`, but `a.1.txt` -> `a.1`. The name of a
+    folder is kept."""
     path = path if path.is_dir() else path.with_suffix("")
     while path.suffix.lower() in (*VIDEOS, *OTHER_FILES):
         path = path.with_suffix("")
@@ -251,10 +249,10 @@ def _stem(path: Path) -> str:
 def job_of(
     path: Path, output: Path, settings: Reconstruct, weights: Weights, outcome: Outcome
 ) -> Job | None:
-    """None where an earlier run has done it; where the times asked for are not to be had, that goes
-    to `outcome`.
+    """The job of a recording; None if an earlier run has finished it, or if it lacks the requested
+    times (recorded in `outcome`).
 
-    Raises OutputError where its output is in the way, RecordingError for what is no recording.
+    Raises OutputError if its output exists, RecordingError if it is no recording.
     """
     size = parse_size(settings.sensor_size)
     recording = open_recording(path, size, settings.strict, settings.columns)
@@ -273,7 +271,7 @@ def job_of(
         logger.warning("%s: done by the run that this one continues", output)
         return None
     check_output(output, settings.overwrite)
-    read_position(output, record, settings.overwrite)  # or it would be refused after hours
+    read_position(output, record, settings.overwrite)  # so that errors come before the work
     return Job(
         recording=recording,
         output=output,
@@ -286,16 +284,16 @@ def job_of(
 
 
 def windows_for(recording: Recording, settings: Reconstruct) -> tuple[Windows, float]:
-    """The windows, and the speed of a video: those asked for, or what suits the recording."""
+    """The windows and the video's speed: as set, or the defaults for this recording."""
     windows, speed = settings.windows, settings.speed or 1.0
     if windows == Windows():
         try:
             windows = usual(until_damage(part_of(recording, settings)))
-        except RecordingError:  # told when its events are read, so that others are done
-            windows = Windows(longest=LONGEST)
-        longest = windows.longest or LONGEST
-        if settings.speed is None and longest < LONGEST / 2:  # gone in 0.4 s
-            speed = longest / LONGEST
+        except RecordingError:  # reported when its events are read, so that others are done
+            windows = Windows(longest=DEFAULT_LONGEST)
+        longest = windows.longest or DEFAULT_LONGEST
+        if settings.speed is None and longest < DEFAULT_LONGEST / 2:  # gone in 0.4 s
+            speed = longest / DEFAULT_LONGEST
     return windows, speed
 
 
@@ -356,7 +354,8 @@ def describe(
     if settings.output.suffix in VIDEOS:
         told |= {"fps": settings.fps, "speed": settings.speed}
     in_a_bag = settings.output.suffix in (".bag", ".ros2")
-    return recorded(settings, ELSEWHERE if in_a_bag else (*ELSEWHERE, "topic", "frame_id"), **told)
+    of_bags = () if in_a_bag else ("topic", "frame_id")
+    return recorded(settings, (*UNRECORDED, *of_bags), **told)
 
 
 # ---- What is said at the end

@@ -1,4 +1,4 @@
-"""Scenes before sensors, or a video file -> HDF5 training sets, one sequence a file.
+"""Random scenes, or a video file -> simulated events in HDF5 training sets, one sequence per file.
 
 The layout is that of event_cnn_minimal (Stoffregen et al. 2020), which many programs read:
 
@@ -10,8 +10,9 @@ The layout is that of event_cnn_minimal (Stoffregen et al. 2020), which many pro
                               duration, num_imgs, num_flow, source, and settings (JSON)
 
 Flow i is the exact displacement from one picture period before image i to image i, divided by that
-period: times the period, what was at x - d(x) in the last image is at x now (backward warping).
-A file appears under its name when it is whole, so a run that was interrupted goes on where it was.
+period. Times the period it is a displacement d for backward warping: what is at x in image i was at
+x - d(x) before. Files appear under their names when they are complete, so an interrupted run
+resumes.
 """
 
 import contextlib
@@ -48,7 +49,7 @@ from firenet_jax.simulation.scenes import (
     video,
 )
 from firenet_jax.simulation.sensor import (
-    LONGEST,
+    MAX_INTERVAL,
     SensorSettings,
     event_list,
     random_sensor,
@@ -72,20 +73,20 @@ from firenet_jax.storage.runs import (
 ROWS = 1 << 16  # events in a chunk of the file, and so many are written at once
 GZIP = 4  # for 50 % more time than level 1: events take 10 % less room, flow 25 %
 FLOW_BITS = 11  # of the fastest pixel's flow, see `rounded_flow`
-POOL = 32  # sequences that choose from the same textures, and how many these are
-TEXTURES, TEXTURE_SIZE = 64, 320
-FEW = 8  # sequences after which their mean size is that of all, more or less
+SEQUENCES_PER_POOL = 32  # sequences that share a pool of textures
+TEXTURES, TEXTURE_SIZE = 64, 320  # of a pool
+MIN_SAMPLE = 8  # sequences whose mean size is a fair estimate of all sizes
 LONGEST_SCENE = 60.0  # seconds; a scene's clock is float32, which by then ticks in 4 us
 PATIENCE = 600  # seconds that processes wait for the first one
 CLIP_SUFFIXES = (".h5", ".hdf5")
-# on which no sequence depends
-ELSEWHERE = ("output", "sequences", "validation", "video", "overwrite", "processes", "process")
+# Settings that no sequence depends on.
+UNRECORDED = ("output", "sequences", "validation", "video", "overwrite", "processes", "process")
 OF_SCENES = ("sequences", "validation", "seconds", "fps", "images", "scene")  # not of a video
 
 
 @dataclass(frozen=True)
 class Simulate:
-    """Make HDF5 files with events, pictures and optical flow: of random scenes, or of a video.
+    """Simulate events, pictures and optical flow of random scenes, or events of a video, as HDF5.
 
     Examples:
       firenet simulate -o data/                                   (the paper's set: 950 and 50)
@@ -95,35 +96,37 @@ class Simulate:
     """
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """A folder, in which train/ and validation/ are made; with --video a name that ends in .h5."""
+    """A folder, which gets the folders train/ and validation/; with --video a name that ends in
+    .h5."""
     sequences: int = 1000
-    """Sequences, those for validation included. A run with more goes on where the last ended."""
+    """Number of sequences, including those for validation. With a larger number an earlier run is
+    extended."""
     validation: int | None = None
-    """So many of them are for validation; one in twenty where nothing is said, as in the paper."""
+    """How many of them are for validation (default: one in twenty, as in the paper)."""
     seconds: float = 2.0
-    """How long each sequence lasts."""
+    """Duration of each sequence."""
     fps: float = 50.0
     """Pictures per second, each with its optical flow."""
     sensor_size: str | None = None
-    """WIDTHxHEIGHT; 240x180 where nothing is said, and a video's own size."""
+    """WIDTHxHEIGHT (default: 240x180, or the size of the video)."""
     images: Path | None = None
-    """Folder of pictures for the textures (the paper took MS-COCO). Without it: photographs that
-    come with scikit-image, where it is installed, and drawn textures."""
+    """Folder of pictures for the textures (the paper used MS-COCO). Default: scikit-image's
+    photographs, if it is installed, and procedural textures."""
     seed: int = 0
-    """Other numbers give other sequences; the same number gives the same again."""
+    """Random seed."""
     video: Path | None = None
-    """Turn this video file into events instead; between its pictures the log intensity changes
-    linearly, and there is no optical flow."""
+    """Convert this video file into events instead. Log intensity is interpolated linearly between
+    its pictures; there is no optical flow."""
     faults: bool = False
-    """What real sensors have: mismatch, noise, leak, hot pixels, finite bandwidth; options below
-    that are given stay as given (--noise 0 0: all but noise)."""
+    """Simulate the faults of real sensors: mismatch, noise, leak, hot pixels, finite bandwidth. The
+    options below take precedence (--noise 0 0: all but noise)."""
     overwrite: bool = False
-    """With --video: replace an output that exists."""
+    """With --video: replace an existing output."""
     processes: int | None = None
-    """How many processes, on this machine or on many, deal the sequences out among them; where
-    nothing is said, those that srun or mpirun has started."""
+    """Number of processes, on one or more machines, that share the sequences. Default: as set by
+    srun or mpirun."""
     process: int | None = None
-    """Which one this is, from 0."""
+    """Index of this process, from 0."""
     scene: SceneSettings = SceneSettings()
     sensor: SensorSettings = SensorSettings()
 
@@ -352,13 +355,12 @@ def write_sequences(
             if done:
                 # The first few sequences say little about the size of all.
                 rest = len(missing) - done
-                _check_room(
-                    settings.output, used / done * (rest if done >= FEW else min(rest, FEW))
-                )
+                expected = rest if done >= MIN_SAMPLE else min(rest, MIN_SAMPLE)
+                _check_room(settings.output, used / done * expected)
             key = jax.random.key(settings.seed)
             for fold in (part, number):
                 key = jax.random.fold_in(key, fold)
-            textures = _textures(settings.images, settings.seed, part, number // POOL)
+            textures = _textures(settings.images, settings.seed, part, number // SEQUENCES_PER_POOL)
             events += write_sequence(
                 path,
                 *sequence(key, textures, settings, sensor, height, width),
@@ -442,7 +444,7 @@ def describe(settings: Simulate) -> dict:
     """All that a sequence depends on, apart from its number; ready for JSON."""
     return recorded(
         settings,
-        but=ELSEWHERE,
+        but=UNRECORDED,
         images=None if settings.images is None else settings.images.resolve(),
         sensor_size=settings.sensor_size or "240x180",
         version=importlib.metadata.version("firenet-jax"),
@@ -551,10 +553,10 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
                     seconds = frame.pts * frame.time_base
                 first = seconds if first is None else first
                 time = round((seconds - first) * 1_000_000)
-                if last is not None and not 0 < time - last <= LONGEST:
+                if last is not None and not 0 < time - last <= MAX_INTERVAL:
                     raise PictureError(
                         f"{path}: picture {number + 1} comes {(time - last) * 1e-6:g} s after the "
-                        f"one before, expected more than 0 and up to {LONGEST * 1e-6:.1f}: "
+                        f"one before, expected more than 0 and up to {MAX_INTERVAL * 1e-6:.1f}: "
                         "convert the clip to a constant rate"
                     )
                 last = time

@@ -1,9 +1,9 @@
-"""What is asked for (a file, a rate, triggers, frames) -> times in a recording's microseconds.
+"""A file of times, a rate, triggers or frames -> times in microseconds on a recording's clock.
 
-A file of times has one a line, in its first column or the one that a first line of names calls
-time, t or timestamp. Their unit and what they count from are those that are named, by an option,
-behind a number (`33.3ms`) or in the first line (`#timestamp [ns]`); else those for which most of
-them lie within the recording, and a notice says which.
+A file of times has one time per line, in its first column or in the one that a header line names
+time, t or timestamp. Unit and origin are given by an option, after a number (`33.3ms`) or in the
+header (`#timestamp [ns]`); otherwise those for which most times lie within the recording are
+taken, and a notice says which.
 """
 
 import re
@@ -16,11 +16,11 @@ from typing import Literal
 import numpy as np
 
 from firenet_jax.errors import RecordingError, SettingsError, logger
-from firenet_jax.events import LATEST, Events, Recording, counted
+from firenet_jax.events import MAX_TIME, Events, Recording, counted
 from firenet_jax.instants import Grid, check_rate, grid
 
 UNITS = {"s": 10**6, "ms": 10**3, "us": 1, "ns": Decimal("0.001")}  # microseconds
-WORDS = {
+UNIT_OF = {
     "s": "s", "sec": "s", "secs": "s", "second": "s", "seconds": "s",
     "ms": "ms", "msec": "ms", "millisecond": "ms", "milliseconds": "ms",
     "us": "us", "µs": "us", "μs": "us", "usec": "us", "microsecond": "us", "microseconds": "us",
@@ -29,33 +29,34 @@ WORDS = {
 COLUMN = re.compile(r"t|time|timestamps?|stamps?")  # without its unit
 NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-zµμ]*)", re.IGNORECASE)
 SPLIT = re.compile(r"[\s,;]+")
-NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 LARGEST = 1 << 28  # bytes of a file of times
 
 
 @dataclass(frozen=True)
 class Times:
-    """Images at given times, in place of one for each window. Choose at most one way."""
+    """Images at given times instead of one per window. Choose at most one of --rate, --at,
+    --between-frames and --triggers."""
 
     rate: float | None = None
-    """So many images per second, from the first event on."""
+    """Images per second, from the first event on."""
     from_zero: bool = False
-    """With --rate: on the grid through time 0 of the recording's clock."""
+    """With --rate: count from time 0 of the recording's clock instead of the first event."""
     at: Path | None = None
-    """At the times in this file, one a line."""
+    """Images at the times in this file, one per line."""
     unit: Literal["s", "ms", "us", "ns"] | None = None
-    """Of the times in the file, where it does not name it."""
+    """With --at: unit of the times, if the file does not state it."""
     since: Literal["start", "zero"] | None = None
-    """Times in the file count from the first event (start), or are those of the recording's own
-    clock (zero). Without: as they fit."""
+    """With --at: whether times count from the first event (start) or are on the recording's clock
+    (zero). Default: whichever fits."""
     between_frames: bool = False
-    """At the times of the camera's frames."""
+    """Images at the times of the camera's frames."""
     triggers: bool = False
-    """At the edges that the recording has of its trigger inputs."""
+    """Images at the edges of the camera's trigger inputs."""
     trigger_edges: Literal["rising", "falling", "both"] = "rising"
-    """Which of them."""
+    """With --triggers: which edges."""
     trigger_input: int | None = None
-    """Only those of this input."""
+    """With --triggers: only this input."""
 
     def __post_init__(self):
         ways = [self.rate, self.at, self.between_frames or None, self.triggers or None]
@@ -91,11 +92,11 @@ class Times:
 def times_of(
     wanted: Times, recording: Recording, chunks: Iterable[Events]
 ) -> np.ndarray | Grid | None:
-    """The times at which images are wanted, in order; None where none are.
+    """The times of the images, in order; None: one image per window.
 
-    chunks: the recording's events, after filters of time; read up to the first for a rate, to the
-    end for a file whose times have to be told apart. Raises RecordingError for a file of times
-    that cannot be used and for a recording that has no frames or triggers.
+    chunks: the recording's events, after filters in time; read up to the first event for a rate,
+    and to the end to determine the unit of a file. Raises RecordingError for an invalid file of
+    times, and for a recording without frames or triggers.
     """
     if not wanted.wanted:
         return None
@@ -171,15 +172,15 @@ def _from_file(
             )
         logger.warning(
             "%s: its %s are taken as %s, %s (--unit and --since say it otherwise)",
-            path, counted(len(times), "time"), NAMES[name],
+            path, counted(len(times), "time"), UNIT_NAMES[name],
             "since the first event" if relative else "on the recording's clock",
         )  # fmt: skip
     return np.unique(times)
 
 
 def read_times(path: Path) -> tuple[list[str], str | None, bool | None]:
-    """A file -> (its numbers as they are written, their unit, whether they are since the start),
-    None for what it does not say. Raises RecordingError naming the line that has no time."""
+    """A file -> (numbers as written, unit, whether they count from the start); None for what it
+    does not state. Raises RecordingError, which names the invalid line."""
     try:
         if path.stat().st_size > LARGEST:
             raise RecordingError(f"{path}: is larger than {LARGEST >> 20} MB: no list of times")
@@ -200,17 +201,17 @@ def read_times(path: Path) -> tuple[list[str], str | None, bool | None]:
         if line.startswith("#"):
             continue
         behind = found[2].lower() if found else None
-        if behind == "" and len(fields) == 2 and fields[1].lower() in WORDS:  # "33.3 ms"
+        if behind == "" and len(fields) == 2 and fields[1].lower() in UNIT_OF:  # "33.3 ms"
             behind = fields[1].lower()
-        if found is None or (behind and behind not in WORDS):
+        if found is None or (behind and behind not in UNIT_OF):
             raise RecordingError(
                 f"{path}, line {number}: expected a time, found {line[:40]!r}: write one a line"
             )
-        if behind and WORDS[behind] != (unit or WORDS[behind]):
+        if behind and UNIT_OF[behind] != (unit or UNIT_OF[behind]):
             raise RecordingError(f"{path}, line {number}: is in {behind}, but before it in {unit}")
         if behind and numbers and unit is None:
             raise RecordingError(f"{path}, line {number}: names a unit, but those before do not")
-        unit = WORDS[behind] if behind else unit
+        unit = UNIT_OF[behind] if behind else unit
         numbers.append(found[1])
     if not numbers:
         raise RecordingError(f"{path}: holds no times: write one a line")
@@ -218,7 +219,7 @@ def read_times(path: Path) -> tuple[list[str], str | None, bool | None]:
 
 
 def _header(line: str, column: int, unit: str | None, since_start: bool | None):
-    """A first line -> (the column of the time, its unit, whether since the start)."""
+    """A header line -> (column of the time, unit, whether times count from the start)."""
     words = line.lstrip("#").strip().lower()
     if re.search(r"since (the )?(start|first event|beginning)|relative", words):
         since_start = True
@@ -227,28 +228,28 @@ def _header(line: str, column: int, unit: str | None, since_start: bool | None):
     joined = re.sub(r"\s*[\[(]\s*(\w+)\s*[\])]", r"_\1", words)  # timestamp [ns] -> timestamp_ns
     for place, name in enumerate(SPLIT.split(joined)):
         stem, _, behind = name.rpartition("_")
-        if behind in WORDS and COLUMN.fullmatch(stem):
-            return place, WORDS[behind], since_start
+        if behind in UNIT_OF and COLUMN.fullmatch(stem):
+            return place, UNIT_OF[behind], since_start
         if COLUMN.fullmatch(name):
             column = place
-    named = {WORDS[word] for word in re.findall(r"\w+", words) if word in WORDS}
+    named = {UNIT_OF[word] for word in re.findall(r"\w+", words) if word in UNIT_OF}
     return column, named.pop() if len(named) == 1 else unit, since_start
 
 
 def _scaled(path: Path, numbers: list[str], unit: str) -> np.ndarray:
-    """Decimal numbers -> int64 microseconds, to the nearest one; exact."""
+    """Decimal numbers -> int64 microseconds, correctly rounded."""
     try:
         times = [int((Decimal(number) * UNITS[unit]).to_integral_value()) for number in numbers]
     except (InvalidOperation, OverflowError):
-        times = [LATEST]
+        times = [MAX_TIME]
     if max(map(abs, times)) >= 2**62:
-        times = [min(max(time, -LATEST), LATEST) for time in times]
+        times = [min(max(time, -MAX_TIME), MAX_TIME) for time in times]
     return np.array(times, np.int64)
 
 
 def _span(chunks: Iterable[Events], whole: bool) -> tuple[int | None, int]:
-    """Times of the first event and, if asked for, of the last one before any damage."""
-    first, last = None, LATEST
+    """The times of the first event and, if `whole`, of the last event before any damage."""
+    first, last = None, MAX_TIME
     try:
         for events in chunks:
             first = int(events.t[0]) if first is None else first

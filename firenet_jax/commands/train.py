@@ -38,9 +38,9 @@ from firenet_jax.windows import Windows, cut
 
 __all__ = ["Train", "run"]
 
-SHARE = 5  # one in so many windows of a recording is held out, and no fewer than a step has
-WARM = 10_000_000  # microseconds before the held-out end at which judging begins
-TOGETHER = 8  # windows that are judged at once
+HELD_OUT_SHARE = 5  # one window in five is held out, but at least as many as a training step has
+WARM_UP = 10_000_000  # microseconds before the held-out end at which judging begins
+WINDOWS_AT_ONCE = 8  # windows that are judged at once
 
 
 class Cut(NamedTuple):
@@ -91,7 +91,7 @@ def cut_off(path: Path, windows: int) -> Cut:
             f"{recording.width}x{recording.height}, expected the same"
         )
     count = len(frames.times) - 1
-    held = max(count // SHARE, windows)
+    held = max(count // HELD_OUT_SHARE, windows)
     if count - held < windows + 1:  # a start is drawn from one place or more
         raise RecordingError(
             f"{path}: has {count + 1} frames, but {2 * windows + 2} are needed to learn from "
@@ -197,17 +197,17 @@ def tell(cuts: list[Cut], settings: Train) -> None:
 def judged(weights: Weights, one: Cut, near: bool) -> Score:
     """How close the images of the held-out end come to the frames at their time.
 
-    near: only where events were since judging began, at most WARM before the end.
+    near: only where events were since judging began, at most WARM_UP before the end.
     """
     times = one.frames.times
-    first = int(np.searchsorted(times, times[one.end] - WARM))
+    first = int(np.searchsorted(times, times[one.end] - WARM_UP))
     windows = cut(one.recording, Windows(between_frames=True), begin=int(times[first]))
     numbered = zip(range(first + 1, len(times)), windows, strict=False)
     state = initial_state(1, one.recording.height, one.recording.width)
     seen, scores, size = jnp.zeros((1, *state.g1.shape[:3]), bool), [], 0
-    for group in in_groups(numbered, TOGETHER):
+    for group in in_groups(numbered, WINDOWS_AT_ONCE):
         rows = [[window.events] for _, window in group]
-        rows += [[Events.empty()]] * (TOGETHER - len(group))
+        rows += [[Events.empty()]] * (WINDOWS_AT_ONCE - len(group))
         size = capacity(sum(len(row[0]) for row in rows), size)
         tensors = voxelise(pack(rows, size), height=state.g1.shape[1], width=state.g1.shape[2])
         state, images = reconstruct(weights, state, tensors)

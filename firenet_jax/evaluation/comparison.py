@@ -1,7 +1,7 @@
-"""Images of a method, frames of a camera -> numbers and pictures, batch by batch.
+"""Images of a method, frames of a camera -> metrics and pictures, batch by batch.
 
-An image (H, W) float32 counts for the frame that is closest to it in time. Both are clipped to 0 to
-1 and equalised before they are compared; the temporal error is of images that are not equalised.
+An image (H, W) float32 is compared with the frame closest to it in time. Both are clipped to 0 to 1
+and equalised before; the temporal error uses images that are not equalised.
 """
 
 import math
@@ -18,19 +18,19 @@ from firenet_jax.events import Frames, Recording
 from firenet_jax.instants import Grid
 from firenet_jax.windows import Windows
 
-BATCH = 8  # images that are compared at once
-STILLS = (0.2, 0.55, 0.9)  # places of the pictures that are kept, in the part that counts
-CLIP = 60  # pictures of a video
+IMAGES_AT_ONCE = 8  # that are compared in one call
+STILLS = (0.2, 0.55, 0.9)  # positions of the stills, relative to the part that counts
+CLIP_LENGTH = 60  # pictures of the report's video
 
 COMPARED = [name for name in METRICS if name not in ("lpips", "temporal_error")]
 
 
 class Gap(Exception):
-    """Why a number is not there, in a few words for a table."""
+    """Why a metric is missing, in a few words for a table."""
 
 
 class Plan(NamedTuple):
-    """What of a recording is reconstructed, and what of it counts."""
+    """Which part of a recording is reconstructed, and which frames count."""
 
     name: str
     recording: Recording
@@ -40,17 +40,17 @@ class Plan(NamedTuple):
     last: int
     origin: int  # microseconds: the sequence's beginning
     begin: int  # microseconds: reconstruction begins here
-    windows: Windows  # as asked for, or as they suit the recording
-    wanted: np.ndarray | Grid | None = None  # times of images; None: one for each window
+    windows: Windows  # as set, or the defaults for the recording
+    wanted: np.ndarray | Grid | None = None  # times of images; None: one per window
 
     @property
     def frames(self) -> Frames:
-        """The recording's, which has some: else there is no plan."""
+        """The recording's frames; without any there is no plan."""
         return cast(Frames, self.recording.frames)
 
 
 class Comparison(NamedTuple):
-    """What one image is compared with."""
+    """An image and the frame that it is compared with."""
 
     place: int  # of the frame, in Plan.times
     image: jax.Array  # (H, W), raw
@@ -64,8 +64,8 @@ Prediction = TypeVar("Prediction")
 def matched(
     predictions: Iterator[tuple[int, Prediction]], times: np.ndarray, tolerance: int
 ) -> Iterator[tuple[int, Prediction]]:
-    """(time, image, or whatever is matched) in time order -> (place of a frame, image): of each
-    frame the closest prediction, if that is at most `tolerance` microseconds away."""
+    """(time, image or other prediction) in time order -> (index of a frame, prediction): for each
+    frame the closest one, if it is at most `tolerance` microseconds away."""
     best: tuple[int, int, Prediction] | None = None
     for moment, image in predictions:
         after = int(np.searchsorted(times, moment))
@@ -84,12 +84,12 @@ def matched(
 
 
 class Measurements:
-    """The numbers of one method's images of one sequence, batch by batch."""
+    """The metrics of one method on one sequence, computed in batches."""
 
     def __init__(self, plan: Plan, kind: Kind, learned: lpips.Lpips | None):
         self.plan = plan
         self.kind: Kind = kind
-        small = min(plan.recording.height, plan.recording.width) < lpips.SMALLEST
+        small = min(plan.recording.height, plan.recording.width) < lpips.MIN_SIDE
         self.learned = None if small else learned
         self.no_lpips = "no weights" if learned is None else "pictures too small"
         self.places: list[int] = []
@@ -97,7 +97,7 @@ class Measurements:
         self.last: tuple[int, np.ndarray, np.ndarray] | None = None  # place, image, truth
 
     def add(self, batch: list[Comparison]) -> tuple[np.ndarray, np.ndarray]:
-        """Measures; returns images and truths as they were compared, (n, H, W) float32."""
+        """Computes the metrics; returns the compared images and truths, (n, H, W) float32."""
         places = [entry.place for entry in batch]
         images = np.stack(jax.device_get([entry.image for entry in batch]))
         if not np.isfinite(images).all():
@@ -117,7 +117,7 @@ class Measurements:
         return compared
 
     def _temporal(self, batch, images, truths) -> list[float | None]:
-        """Of images that are not equalised: it is flicker that counts, not contrast."""
+        """Of images that are not equalised, because it measures flicker, not contrast."""
         last = self.last or (-1, images[0], truths[0])
         befores = [last[0], *(entry.place for entry in batch[:-1])]
         self.last = batch[-1].place, images[-1], truths[-1]
@@ -131,14 +131,14 @@ class Measurements:
         flows = np.stack([e.flow if k else still for e, k in zip(batch, known, strict=True)])
         previous = np.concatenate([last[1][None], images[:-1]])
         previous_truths = np.concatenate([last[2][None], truths[:-1]])
-        visible = np.asarray(np.isfinite(flows).all(-1))  # files say nan where they know no flow
+        visible = np.asarray(np.isfinite(flows).all(-1))  # files hold nan where flow is unknown
         errors = metrics.temporal_error(
             *map(_whole, (images, previous, flows, truths, previous_truths, visible))
         ).tolist()
         return [error if k else None for error, k in zip(errors, known, strict=False)]
 
     def result(self, empty: int, seconds: float) -> Measured:
-        """A value that is not finite becomes null, its metric a gap."""
+        """The results. A value that is not finite becomes null, and its metric a gap."""
         gaps = {}
         values = {}
         for name, series in self.values.items():
@@ -166,8 +166,8 @@ class Measurements:
 
 
 def _whole(batch: np.ndarray) -> np.ndarray:
-    """(n, ...) -> (BATCH, ...), the last entry repeated: one size compiles once."""
-    return np.concatenate([batch, np.repeat(batch[-1:], BATCH - len(batch), 0)])
+    """(n, ...) -> (IMAGES_AT_ONCE, ...), the last entry repeated: one size compiles once."""
+    return np.concatenate([batch, np.repeat(batch[-1:], IMAGES_AT_ONCE - len(batch), 0)])
 
 
 @jax.jit
@@ -176,13 +176,13 @@ def _compare(images: jax.Array, truths: jax.Array) -> dict[str, jax.Array]:
 
 
 class Pictures:
-    """The few pictures that the report shows, out of all: stills and a stretch for the video."""
+    """The pictures for the report: stills and a clip."""
 
     def __init__(self, plan: Plan):
         count = plan.last - plan.first
         self.numbers = plan.numbers
         self.wanted = [plan.first + int(share * count) for share in STILLS]
-        self.begin = plan.first + max(0, (count - CLIP) // 2)
+        self.begin = plan.first + max(0, (count - CLIP_LENGTH) // 2)
         self.kept: dict[str, list] = {"stills": [], "clip": []}
 
     def add(self, batch: list[Comparison], compared: tuple[np.ndarray, np.ndarray]) -> None:
@@ -191,7 +191,7 @@ class Pictures:
             if self.wanted and entry.place >= self.wanted[0]:
                 self.wanted = [place for place in self.wanted if place > entry.place]
                 self.kept["stills"].append(picture)
-            if entry.place >= self.begin and len(self.kept["clip"]) < CLIP:
+            if entry.place >= self.begin and len(self.kept["clip"]) < CLIP_LENGTH:
                 self.kept["clip"].append(picture)
 
     def arrays(self) -> dict[str, np.ndarray]:

@@ -18,7 +18,7 @@ Kind = Literal["none", "global", "local", "clahe"]
 LEVELS = 256
 RADIUS = 55  # pixels, of the surroundings of "local": EVREAL's, as the papers do not give theirs
 TILES = 8  # of "clahe", down and across
-CLIP = 2.0  # of "clahe": a level may have this many times its share of a tile
+CLIP_LIMIT = 2.0  # of "clahe": a level may have this many times its share of a tile
 
 
 def equalise(images, kind: Kind) -> np.ndarray:
@@ -92,7 +92,7 @@ def _clipped_tables(tiles: np.ndarray) -> np.ndarray:
     """(tiles, pixels) uint8 -> (tiles, 256) float32: level -> level 0 to 255, never steep."""
     area = tiles.shape[1]
     counts = np.stack([np.bincount(tile, minlength=LEVELS) for tile in tiles])
-    limit = max(1, int(CLIP * area / LEVELS))
+    limit = max(1, int(CLIP_LIMIT * area / LEVELS))
     excess = np.maximum(counts - limit, 0).sum(1, keepdims=True)
     # what was cut off goes to all levels alike, what does not divide to evenly spaced ones
     each, rest = excess // LEVELS, excess % LEVELS

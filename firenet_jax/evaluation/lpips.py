@@ -22,7 +22,7 @@ import numpy as np
 from firenet_jax.errors import SettingsError
 from firenet_jax.storage.pytorch_file import identify, read_state_dict, take
 
-SMALLEST = 31  # pixels of a side: AlexNet's last pool then makes one of them
+MIN_SIDE = 31  # pixels of a side: AlexNet's last pool then makes one of them
 # of the three colours in -1 to 1: ImageNet's means and deviations, rounded
 SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
 SCALE = np.array([0.458, 0.448, 0.450], np.float32)
@@ -49,8 +49,8 @@ def lpips(weights: Lpips, images: jax.Array, truths: jax.Array) -> jax.Array:
     images, truths = jnp.asarray(images, jnp.float32), jnp.asarray(truths, jnp.float32)
     if images.shape != truths.shape or images.ndim < 2:
         raise ValueError(f"images {images.shape} cannot be compared with truths {truths.shape}")
-    if min(images.shape[-2:]) < SMALLEST:
-        size = f"{SMALLEST}x{SMALLEST}"
+    if min(images.shape[-2:]) < MIN_SIDE:
+        size = f"{MIN_SIDE}x{MIN_SIDE}"
         raise SettingsError(f"LPIPS needs {size} pixels at least, not {images.shape[-2:]}")
     distance = jnp.float32(0)
     both = _features(weights, jnp.stack([images, truths]))

@@ -1,12 +1,12 @@
-"""Names and weights -> methods: whatever makes images of events, behind one interface.
+"""Names and weights -> methods that turn events into images, behind one interface.
 
     state = method.initial(height, width)
     state, image = method.step(state, window)        image: (H, W) float32 on the device
 
 Windows are consecutive, in time order, of any size; images are nominally 0 to 1 and not clipped.
-An image at a given time is a step whose state is thrown away (`look`).
-A method is a function below and a line in `load`. Networks compile once for a sensor size; what
-packs events compiles for each of a few sizes of windows (`tensors.CAPACITIES`).
+An image at a given time is a step whose new state is discarded (`look`).
+A method is a function below and a line in `load`. Networks compile once per sensor size; packing
+compiles for each of a few window sizes (`tensors.CAPACITIES`).
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ from firenet_jax.storage.files import named
 from firenet_jax.tensors import normalise, pack, voxelise
 from firenet_jax.windows import Window
 
-NAMES = ("firenet", "e2vid", "hf", "mr")
+METHODS = ("firenet", "e2vid", "hf", "mr")
 
 
 class Method(NamedTuple):
@@ -39,14 +39,14 @@ class Method(NamedTuple):
     name: str
     initial: Callable[[int, int], Any]  # height, width -> the state before the first window
     step: Callable[[Any, Window], tuple[Any, jax.Array]]  # (state, window) -> (state, image)
-    record: dict  # all that its images depend on, ready for JSON
+    record: dict  # everything that its images depend on, ready for JSON
     between: Callable[[float, Any, Any], Any] | None = None
-    """(share, state, next state) -> the state in between where a look begins; None: of a method
-    that has no diet, and looks at the events since the last state, from there."""
+    """(share, state, next state) -> the state from which a look starts, between the two. None, for
+    methods that process single events: it starts from the last state and takes the events since."""
 
 
 class Missing(NamedTuple):
-    """A method that was named but cannot run."""
+    """A requested method that cannot run."""
 
     name: str
     reason: str
@@ -81,8 +81,8 @@ def load(
             raise SettingsError(f"weights are given, but {name} is not among the methods: add it")
     found: list[Method | Missing] = []
     for name in names:
-        if name not in NAMES:
-            raise SettingsError(f"no method {name!r}: choose from {', '.join(NAMES)}")
+        if name not in METHODS:
+            raise SettingsError(f"no method {name!r}: choose from {', '.join(METHODS)}")
         if name == "firenet" and weights:
             found += [firenet(named(path).stem, load_weights(path)) for path in weights]
         elif name == "firenet":

@@ -8,13 +8,14 @@ entries, (...,) float32.
     similarities, 1 if equal    ssim  ms_ssim  haarpsi  cw_ssim  equalised_ssim;   psnr is in dB
     without a ground truth      event_correlation
 
-gmsd, haarpsi, cw_ssim and detail are blind to a negative: alone they reward pictures with the
-polarity inverted. Gradients are finite everywhere, for equal, flat and zero images too.
+gmsd, haarpsi, cw_ssim and detail are blind to a negative: used alone they accept pictures with
+inverted polarity. All gradients are finite, for equal, flat and zero images too.
 
-Every linear filter here is separable and applied as two matrices, borders, decimation and all:
-rows @ image @ columns.T. On XLA's CPU (40 images of 96x96, SSIM with its gradient, two cores) that
-takes 5 to 8 ms; sums of shifted images take 85 to 400, because the compiler fuses one pass into the
-other and computes it again for each tap, and convolutions of one channel take 320 to 350.
+Every linear filter here is separable and applied as two matrices that include borders and
+decimation: rows @ image @ columns.T. On XLA's CPU backend (40 images of 96x96, SSIM with its
+gradient, two cores) that takes 5 to 8 ms. Sums of shifted images take 85 to 400, because the
+compiler fuses one pass into the other and recomputes it for each tap; convolutions of one channel
+take 320 to 350.
 """
 
 import math
@@ -34,8 +35,8 @@ Border = Literal["valid", "symmetric", "constant", "edge"]
 def _matrix(size: int, weights, border: Border = "valid", stride: int = 1) -> np.ndarray:
     """(outputs, size) float32: the matrix that correlates `size` pixels with the weights.
 
-    border: "valid" keeps the places where all weights meet a pixel; other names are modes of
-    numpy.pad, which keep the size (an even number of weights reaches one farther back).
+    border: "valid" keeps the positions where all weights are inside the image; the others are modes
+    of numpy.pad and keep the size (an even number of weights reaches one farther back).
     """
     padded = np.eye(size)
     taps = len(weights)
@@ -50,7 +51,7 @@ def _matrix(size: int, weights, border: Border = "valid", stride: int = 1) -> np
 
 
 def _apply(image: jax.Array, rows: np.ndarray, columns: np.ndarray) -> jax.Array:
-    """rows @ image @ columns.T, in whole float32 also where the default is shorter (TF32)."""
+    """rows @ image @ columns.T, in full float32 even if the default is less (TF32)."""
     image = jnp.einsum("ih,...hw->...iw", rows, image, precision="highest")
     return jnp.einsum("...hw,jw->...hj", image, columns, precision="highest")
 
@@ -74,7 +75,7 @@ def _gaussian(sigma: float, radius: int) -> np.ndarray:
 
 
 def _root(x: jax.Array) -> jax.Array:
-    """The square root, with gradient 0 at 0 where it is infinite."""
+    """The square root, with gradient 0 instead of infinity at 0."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
@@ -106,9 +107,8 @@ def l1(image: jax.Array, truth: jax.Array) -> jax.Array:
 
 @jax.jit
 def centred(image: jax.Array, truth: jax.Array) -> jax.Array:
-    """Mean absolute difference of images without their means: events tell no absolute brightness.
-
-    Sees a negative.
+    """Mean absolute difference after subtracting each image's mean, as events carry no absolute
+    brightness. Sees a negative.
     """
     image, truth = _compared(image, truth)
     difference = image - truth
@@ -117,10 +117,10 @@ def centred(image: jax.Array, truth: jax.Array) -> jax.Array:
 
 @jax.jit
 def contrast(image: jax.Array, truth: jax.Array) -> jax.Array:
-    """Distance of the standard deviations over all pixels. Blind to a negative, and to places.
+    """Difference of the standard deviations over all pixels. Blind to a negative and to positions.
 
-    A distance that seeks the mean is best answered in grey wherever a network is not sure; this one
-    asks for as much black and white as there is.
+    Distances that are minimal at the mean favour grey wherever a network is unsure; this one
+    rewards as much contrast as the truth has.
     """
     image, truth = _compared(image, truth)
 
@@ -147,7 +147,7 @@ def _ssim_factors(image, truth, sigma, data_range) -> tuple[jax.Array, jax.Array
     """
     weights = _gaussian(sigma, radius=int(3.5 * sigma + 0.5))
     c1, c2 = 2 * (0.01 * data_range) ** 2, 2 * (0.03 * data_range) ** 2
-    middle = data_range  # of s; variances do not see it go, and float32 has more digits for them
+    middle = data_range  # of s; subtracting it leaves variances unchanged, but more accurate
     s, d = image + truth - middle, image - truth
     mean_s, mean_d, square_s, square_d = (
         _filter(map_, weights, weights) for map_ in (s, d, s**2, d**2)
@@ -176,8 +176,8 @@ def ssim(
 
 @jax.jit
 def ssim_where(image: jax.Array, truth: jax.Array, there: jax.Array) -> jax.Array:
-    """The mean of `ssim` over the windows in whose middle is a pixel that is `there`, (..., H, W)
-    bool; NaN where none is."""
+    """The mean of `ssim` over the windows whose centre is `there`, (..., H, W) bool; NaN if there
+    is none."""
     luminance, cs = _ssim_factors(*_compared(image, truth), 1.5, 1.0)
     margin = WINDOW // 2
     there = there[..., margin:-margin, margin:-margin]
@@ -198,10 +198,10 @@ def ms_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     """Multi-scale SSIM (Wang, Simoncelli, Bovik 2003), 0 to 1; sees a negative (it becomes 0).
 
     mean(l_M cs_M)^w_M prod_{j<M} mean(cs_j)^w_j, halving the images by 2x2 means from scale to
-    scale. Smaller images have fewer scales, their weights then sum to 1.
+    scale. Small images have fewer scales, whose weights are scaled to sum to 1.
     A factor below 0.001 is continued by a straight line and is 0 below 0, so that gradients stay
-    finite. There is no gradient where one scale is anti-correlated: a training that may start
-    there needs another term beside this one.
+    finite. The gradient is 0 if one scale is anti-correlated: training that may start there needs
+    another term as well.
     """
     image, truth = _compared(image, truth)
     scales = ms_ssim_scales(*image.shape[-2:])
@@ -220,17 +220,17 @@ def ms_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     return product
 
 
-RANKED = 6  # pixels down and across with which every pixel is compared
+RANKED = 6  # rows and columns of the pixels with which every pixel is compared
 
 
 @jax.jit
 def equalised_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     """SSIM after a soft histogram equalisation of both images, -1 to 1; sees a negative.
 
-    A pixel becomes the part of the image that is darker than it, the mean over 6x6 evenly spaced
-    pixels q of sigmoid((I - I_q) / 0.03): any brightening that keeps the order hardly matters, and
-    texture down to a contrast of about 0.03 weighs as much as strong one. It is what papers measure
-    when they equalise images (`equalise`) before SSIM, with a gradient and without surroundings.
+    A pixel becomes the share of the image that is darker than it: the mean over 6x6 evenly spaced
+    pixels q of sigmoid((I - I_q) / 0.03). Monotonic changes of brightness hardly matter, and
+    texture down to a contrast of about 0.03 counts as much as strong texture. It is a global,
+    differentiable version of what papers measure when they equalise (`equalise`) before SSIM.
     """
     return ssim(*(_equalised(picture) for picture in _compared(image, truth)))
 
@@ -260,10 +260,9 @@ def gmsd(image: jax.Array, truth: jax.Array) -> jax.Array:
     """Gradient magnitude similarity deviation (Xue et al. 2014), 0 to 0.5.
 
     The standard deviation of (2 m_I m_G + c) / (m_I^2 + m_G^2 + c), m the magnitude of Prewitt's
-    gradient after halving by 2x2 means, c = 170 / 255^2. Unlike in the original the image's
-    border, where the filter meets nothing, does not count.
-    Blind to a negative and to any offset: gmsd(1 - I, I) = 0. And, being a deviation, to errors
-    that are the same everywhere.
+    gradient after halving by 2x2 means, c = 170 / 255^2. Unlike in the original, the image's border
+    does not count. Blind to a negative and to any offset: gmsd(1 - I, I) = 0. As a deviation it is
+    also blind to errors that are the same everywhere.
     """
     image, truth = (_gradient_magnitude(_halved(picture)) for picture in _compared(image, truth))
     constant = 170 / 255**2
@@ -288,7 +287,7 @@ def haarpsi(image: jax.Array, truth: jax.Array) -> jax.Array:
 
     (logit(p / (p + q)) is log(p / q), here with q = sum sigmoid(-alpha S) W.)
 
-    Blind to a negative but for the border, where the zeros beyond are seen. (The authors' program
+    Blind to a negative, except at the border, because of the zero padding. (The authors' program
     halves with blocks that begin one pixel earlier.)
     """
     constant, alpha = 30 / 255**2, 4.2
@@ -302,7 +301,7 @@ def haarpsi(image: jax.Array, truth: jax.Array) -> jax.Array:
         weight = jnp.maximum(jnp.abs(a[2]), jnp.abs(b[2]))
         p += (jax.nn.sigmoid(alpha * similarity) * weight).sum((-2, -1))
         q += (jax.nn.sigmoid(-alpha * similarity) * weight).sum((-2, -1))
-    some = q > 1e-6  # else both images are black, thus equal
+    some = q > 1e-6  # otherwise both images are black, and so equal
     ratio = jnp.where(some, p, math.exp(alpha)) / jnp.where(some, q, 1.0)
     return (jnp.log(ratio) / alpha) ** 2
 
@@ -338,11 +337,11 @@ def nlpd(image: jax.Array, truth: jax.Array) -> jax.Array:
 
     D = mean_k sqrt(mean (z_k(I) - z_k(G))^2),  z_k = y_k / (sigma_k + P_k * |y_k|)
 
-    with y the six bands of a Laplacian pyramid, its low-pass residual among them, so that the
-    distance sees offsets and negatives. Bands without much contrast weigh as much as those with:
-    noise in flat places costs. P is convolved with zeros beyond the border; the pyramid mirrors
-    the image when it goes down and repeats its border when it goes up. For a photograph about 0.2
-    if blurred by 1.5 pixels, 0.5 with noise of 0.1, 1.5 for a flat image and 3 for a negative.
+    with y the six bands of a Laplacian pyramid including its low-pass residual, so that the
+    distance sees offsets and negatives. Bands with little contrast count as much as others, so
+    noise in flat areas is penalised. P is convolved with zero padding; the pyramid mirrors the
+    image on the way down and repeats its border on the way up. For a photograph it is about 0.2 if
+    blurred by 1.5 pixels, 0.5 with noise of 0.1, 1.5 for a flat image and 3 for a negative.
     """
     image, truth = _compared(image, truth)
     distance = jnp.float32(0)
@@ -361,7 +360,7 @@ def nlpd(image: jax.Array, truth: jax.Array) -> jax.Array:
 
 
 def _enlarged(image: jax.Array, height: int, width: int) -> jax.Array:
-    """Back to twice the size: one border pixel repeated, zeros between all, the filter, times 4."""
+    """To twice the size: repeat the border pixel, insert zeros, filter, times 4."""
 
     def matrix(size):
         padded = np.pad(np.eye((size + 1) // 2), ((1, 1), (0, 0)), "edge")
@@ -373,7 +372,7 @@ def _enlarged(image: jax.Array, height: int, width: int) -> jax.Array:
 
 
 def _divided(detail: jax.Array, band: int) -> jax.Array:
-    """y / (sigma + P * |y|). A convolution: what stands above in P weighs the pixel below."""
+    """y / (sigma + P * |y|), * a convolution: the upper entry of P weighs the pixel below."""
     sigma, (above, left, right, below) = NLPD_BANDS[band]
     farther = NLPD_FARTHER if band == 0 else 0.0
     size, activity = detail.shape, jnp.abs(detail)
@@ -384,33 +383,33 @@ def _divided(detail: jax.Array, band: int) -> jax.Array:
     return detail / (sigma + near)
 
 
-DETAIL = (0.8, 1.6)  # pixels: Gaussian blurs, each of which leaves a band of detail
+DETAIL_SIGMAS = (0.8, 1.6)  # pixels, of the Gaussian blurs between which lie the bands of detail
 
 
 @jax.jit
 def detail(image: jax.Array, truth: jax.Array) -> jax.Array:
     """Mean absolute difference between the local strengths of fine detail, >= 0.
 
-    A band is what a Gaussian takes away from the picture, or from what the Gaussian before left of
-    it; its strength at a pixel is the root of its mean square under a Gaussian of 2.5 pixels.
+    A band is the difference between the picture and its blur by a Gaussian, or between two such
+    blurs. Its strength at a pixel is its root mean square under a Gaussian of 2.5 pixels.
 
         mean_bands mean |s(I) - s(G)|,  s = sqrt(1e-6 + G_2.5 * band^2)
 
-    It asks how much detail there is, not where in it each stroke is: what cannot be placed, other
-    distances rather have blurred. Blind to a negative and to offsets.
+    It measures how much detail there is, not its exact position, whereas other distances favour
+    blur over misplaced detail. Blind to a negative and to offsets.
     """
     image, truth = _compared(image, truth)
     window = _gaussian(2.5, radius=6)
 
     def bands(picture):
-        for sigma in DETAIL:
+        for sigma in DETAIL_SIGMAS:
             blur = _gaussian(sigma, radius=math.ceil(3 * sigma))
             smooth = _filter(picture, blur, blur, "symmetric")
             yield jnp.sqrt(_filter((picture - smooth) ** 2, window, window, "symmetric") + 1e-6)
             picture = smooth
 
     pairs = zip(bands(image), bands(truth), strict=True)
-    return sum((_mean(jnp.abs(a - b)) for a, b in pairs), jnp.float32(0)) / len(DETAIL)
+    return sum((_mean(jnp.abs(a - b)) for a, b in pairs), jnp.float32(0)) / len(DETAIL_SIGMAS)
 
 
 @jax.jit
@@ -474,9 +473,9 @@ def random_features(image: jax.Array, truth: jax.Array, *, seed: int = 0) -> jax
 
     mean_l mean_xy sum_c (n_l(I) - n_l(G))^2 as LPIPS (Zhang et al. 2018) with all weights 1, n_l
     the features of layer l divided by their norm over channels. Three layers of halving, 3x3
-    convolution and ReLU (16, 32, 64 channels, He's normal weights); the first halving turns 2x2
+    convolution and ReLU (16, 32, 64 channels, He normal weights); the first halving turns 2x2
     pixels into 4 channels, the others take means. Liu et al. 2021 train with such features.
-    seed: another one is another distance; compare only numbers of the same.
+    seed: of the network; only values with the same seed are comparable.
     """
     kernels = random_kernels(seed)
     both = (_random_layers(kernels, picture) for picture in _compared(image, truth))
@@ -485,8 +484,8 @@ def random_features(image: jax.Array, truth: jax.Array, *, seed: int = 0) -> jax
 
 
 def random_kernels(seed: int) -> list[np.ndarray]:
-    """The kernels of the random network, (3, 3, inputs, outputs) float32, the same everywhere."""
-    rng = np.random.RandomState(seed)  # unlike numpy's newer generators it never changes
+    """The kernels of the random network, (3, 3, inputs, outputs) float32."""
+    rng = np.random.RandomState(seed)  # unlike numpy's newer generators, frozen for all versions
     return [
         (math.sqrt(2 / (9 * inputs)) * rng.standard_normal((3, 3, inputs, outputs))).astype("f4")
         for inputs, outputs in ((4, 16), (16, 32), (32, 64))
@@ -511,7 +510,7 @@ def _random_layers(kernels: list[np.ndarray], image: jax.Array) -> list[jax.Arra
             precision="highest",
         )
         x = jax.nn.relu(x)
-        # 1e-4 against a norm of about 1: where there is nothing to see, nothing is compared
+        # 1e-4, small against a usual norm of 1: features of empty areas stay near zero.
         unit = x / jnp.sqrt((x**2).sum(-1, keepdims=True) + 1e-4)
         layers.append(unit.reshape(*leading, *unit.shape[1:]))
     return layers
@@ -534,19 +533,19 @@ def temporal_error(
     previous_truth: jax.Array,
     visible: jax.Array | None = None,
 ) -> jax.Array:
-    """How much an image differs from its predecessor moved along (Lai et al. 2018), >= 0.
+    """How much an image differs from its warped predecessor (Lai et al. 2018), >= 0.
 
         mean( M |I_k - W(I_{k-1})| ),  M = exp(-50 (G_k - W(G_{k-1}))^2)
 
     displacement: (..., H, W, 2) pixels from k-1 to k, x then y, on the grid of image k; W is
     `warp.warp`. visible: (..., H, W) bool, False where image k shows what image k-1 did not.
-    M is 0 there and where the warp leaves the picture; the mean is over all pixels.
-    Blind to any error that moves along with the picture, a negative and a flat image included.
+    M is 0 there and where the warp leaves the image; the mean is over all pixels.
+    Blind to errors that move along with the image, including a negative and a flat image.
     """
     image, truth = _compared(image, truth)
     if visible is None:
         visible = jnp.ones(image.shape, bool)
-    # where nothing corresponds the displacement may be anything, even nan
+    # Where nothing corresponds, the displacement is arbitrary, even nan.
     displacement = jnp.where(visible[..., None], displacement, 0.0)
     warped, inside = warp(previous, displacement)
     warped_truth, _ = warp(previous_truth, displacement)
@@ -554,30 +553,29 @@ def temporal_error(
     return _mean(mask * jnp.abs(image - warped))
 
 
-BLOCK = 14  # pixels on a side of what moves as one in `event_correlation`
+PATCH = 14  # pixels: the side of the blocks with one velocity in `event_correlation`
 
 
 @jax.jit
 def event_correlation(image: jax.Array, votes: jax.Array) -> jax.Array:
-    """How well the events that follow an image are those of its moving on, 0 to 1; no truth needed.
+    """How well an image, if it moves, explains the next events, 0 to 1; needs no ground truth.
 
-    votes: (..., H, W), the next event tensor summed over its bins, or sums of any polarities.
+    votes: (..., H, W), the next event tensor summed over its bins, or any sums of polarities.
 
         E ~ -v . grad I,   sqrt( sum fit^2 / sum E^2 )
 
     the linearised model of events (Gallego, Forster, Mueggler, Scaramuzza, "Event-based camera pose
     tracking using a generative event model", 2015), with the best v for each block of 14x14 pixels,
-    image and votes under a Gaussian of 0.7 pixels. Edges in the wrong place, unsharp ones and noise
-    make it smaller; contrast does not change it, nor does a negative. Two numbers are fitted to a
-    block, so an image that has nothing to do with the events has more than 0: compare with what
-    the same votes give when they are turned by 180 degrees. What is beyond the last whole block
-    does not count. 0 where there are no events.
+    image and votes blurred by a Gaussian of 0.7 pixels. Misplaced or blurred edges and noise make
+    it smaller; contrast and a negative do not change it. Because two numbers are fitted per block,
+    even an unrelated image gets more than 0: as a baseline, rotate the votes by 180 degrees. Pixels
+    beyond the last whole block do not count. 0 if there are no events.
     Raises SettingsError for images smaller than a block.
     """
     image, votes = _compared(image, votes)
-    rows, columns = (side // BLOCK for side in image.shape[-2:])
+    rows, columns = (side // PATCH for side in image.shape[-2:])
     if not rows * columns:
-        raise SettingsError(f"{BLOCK}x{BLOCK} pixels at least are needed, not {image.shape[-2:]}")
+        raise SettingsError(f"{PATCH}x{PATCH} pixels at least are needed, not {image.shape[-2:]}")
     blur = _gaussian(0.7, radius=3)
     image, votes = (_filter(picture, blur, blur, "symmetric") for picture in (image, votes))
     difference = (-0.5, 0.0, 0.5)
@@ -586,8 +584,8 @@ def event_correlation(image: jax.Array, votes: jax.Array) -> jax.Array:
     )
 
     def summed(values):
-        whole = values[..., : rows * BLOCK, : columns * BLOCK]
-        return whole.reshape(*values.shape[:-2], rows, BLOCK, columns, BLOCK).sum((-3, -1))
+        whole = values[..., : rows * PATCH, : columns * PATCH]
+        return whole.reshape(*values.shape[:-2], rows, PATCH, columns, PATCH).sum((-3, -1))
 
     # The normal equations of two unknowns; a little is added so that a flat block has a solution.
     least = 1e-6 * summed(down**2 + across**2) + 1e-12

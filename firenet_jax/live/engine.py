@@ -25,8 +25,8 @@ from firenet_jax.pictures import Display
 from firenet_jax.reconstruction import Network, events_to_pictures, initial_session
 from firenet_jax.tensors import capacity, pack
 
-REMEMBERED = 2000  # latencies, of which median and 95th percentile are told
-BAD = 1000  # events, of which most may not be bad at the start
+LATENCIES_KEPT = 2000  # latencies, of which median and 95th percentile are told
+BAD_AFTER = 1000  # events, of which most may not be bad at the start
 
 
 class Limits(NamedTuple):
@@ -52,7 +52,7 @@ class Figures:
     bad: int = 0  # outside the sensor or back in time: left out
     shown: int = 0  # windows that became pictures
     dropped: int = 0  # windows that did not
-    latencies: deque = field(default_factory=lambda: deque(maxlen=REMEMBERED))  # seconds
+    latencies: deque = field(default_factory=lambda: deque(maxlen=LATENCIES_KEPT))  # seconds
 
     def summary(self) -> dict:
         """Counts, and latency's median and 95th percentile in ms over the last windows."""
@@ -85,7 +85,7 @@ def sound(
             figures.events += len(events)
             if not good.all():
                 figures.bad += int(len(good) - good.sum())
-                if figures.events >= BAD and 2 * figures.bad > figures.events:
+                if figures.events >= BAD_AFTER and 2 * figures.bad > figures.events:
                     raise RecordingError(
                         f"{figures.bad:,} of {figures.events:,} events lie outside a sensor of "
                         f"{width}x{height} pixels or go back in time: are --sensor-size and --wire "

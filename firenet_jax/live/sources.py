@@ -35,7 +35,7 @@ BINARY = {
     "t32_x16_y15_on1": np.dtype([("t", "<u4"), ("x", "<u2"), ("y_on", "<u2")]),
 }
 WIRES = (*BINARY, "text")
-NOTHING = Events.empty()
+NO_EVENTS = Events.empty()
 
 
 class Source(NamedTuple):
@@ -80,7 +80,7 @@ def replay(
                 while (wait := due - clock()) > 0:
                     sleep(min(wait, TICK))
                     if wait > TICK:
-                        yield NOTHING
+                        yield NO_EVENTS
                 yield Events(t[start:stop], *(c[start:stop] for c in (chunk.x, chunk.y, chunk.p)))
                 start = stop
             last = int(t[-1])
@@ -166,7 +166,7 @@ def decoded(pieces: Iterable[bytes], wire: str, datagrams: bool = False) -> Iter
     decode = _text if wire == "text" else _Binary(BINARY[wire])
     rest = b""
     for piece in pieces:
-        events, rest = decode(rest + piece) if piece else (NOTHING, rest)
+        events, rest = decode(rest + piece) if piece else (NO_EVENTS, rest)
         rest = b"" if datagrams else rest
         yield events
 
@@ -202,7 +202,7 @@ def _text(data: bytes) -> tuple[Events, bytes]:
     rows = [line.split() for line in lines.splitlines()]
     rows = [row for row in rows if len(row) not in (0, 2) and not row[0].startswith(b"#")]
     if not rows:
-        return NOTHING, rest
+        return NO_EVENTS, rest
     try:
         seconds = any(b"." in row[0] for row in rows)
         t, x, y, p = np.array(rows, np.float64).T
@@ -244,7 +244,7 @@ def camera() -> Source:
             for _, packet in device:
                 rows = None if packet is None else packet.polarity_events
                 if rows is None or not len(rows):
-                    yield NOTHING
+                    yield NO_EVENTS
                 else:
                     yield Events.of(rows["t"], rows["x"], rows["y"], rows["on"])
 

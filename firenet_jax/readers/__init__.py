@@ -23,8 +23,7 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError, logger
 from firenet_jax.events import (
-    LATEST,
-    REACH,
+    MAX_TIME,
     Events,
     Frames,
     Recording,
@@ -36,6 +35,7 @@ from firenet_jax.events import (
     no_triggers,
     until_damage,
 )
+from firenet_jax.settings import LONGEST_SIDE
 from firenet_jax.storage.files import check_readable, forbidden
 
 # In the order in which they are asked.
@@ -144,10 +144,10 @@ def _stated(path: Path, source: Source) -> tuple[int, int] | None:
     if source.size is None:
         return None
     height, width = map(int, source.size)
-    if not (0 < height <= REACH and 0 < width <= REACH):
+    if not (0 < height <= LONGEST_SIDE and 0 < width <= LONGEST_SIDE):
         raise RecordingError(
-            f"{path}: states a sensor of {width}x{height} pixels, expected sides of 1 to {REACH}: "
-            "pass the right --sensor-size WIDTHxHEIGHT"
+            f"{path}: states a sensor of {width}x{height} pixels, expected sides of 1 to "
+            f"{LONGEST_SIDE}: pass the right --sensor-size WIDTHxHEIGHT"
         )
     return height, width
 
@@ -239,7 +239,7 @@ def to_events(
     for name, column in (("the time", t), ("x", x), ("y", y), ("the polarity", p)):
         if column.dtype.kind not in "biuf":
             raise RecordingError(f"{path}: {name} is stored as {column.dtype}, expected numbers")
-    latest = LATEST / 1e6 if t.dtype.kind == "f" else LATEST
+    latest = MAX_TIME / 1e6 if t.dtype.kind == "f" else MAX_TIME
     if not (-latest < t.min() and t.max() < latest):  # so put that NaN fails
         bad = ~((-latest < t) & (t < latest))
         wrong.append((bad, t, "the time", "expected seconds or whole microseconds"))
@@ -247,9 +247,9 @@ def to_events(
         if column.dtype.kind == "f" and (column != np.rint(column)).any():  # so does NaN
             bad = column != np.rint(column)
             wrong.append((bad, column, name, "expected a whole number of pixels"))
-        if not (-REACH <= column.min() and column.max() < REACH):
-            bad = ~((column >= -REACH) & (column < REACH))
-            wrong.append((bad, column, name, f"expected a coordinate below {REACH}"))
+        if not (-LONGEST_SIDE <= column.min() and column.max() < LONGEST_SIDE):
+            bad = ~((column >= -LONGEST_SIDE) & (column < LONGEST_SIDE))
+            wrong.append((bad, column, name, f"expected a coordinate below {LONGEST_SIDE}"))
     if p.dtype.kind != "b":
         if p.dtype.kind == "f" or p.min() < -1 or p.max() > 1:
             bad = ~np.isin(p, (-1, 0, 1))

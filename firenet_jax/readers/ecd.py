@@ -20,7 +20,7 @@ from firenet_jax.errors import RecordingError, logger
 from firenet_jax.events import Frames
 from firenet_jax.readers import Source, microseconds, reading, text, to_frame
 
-MOST = 1 << 26  # bytes of images.txt, and of a picture
+MAX_BYTES = 1 << 26  # bytes of images.txt, and of a picture
 
 
 def matches(path: Path) -> bool:
@@ -60,9 +60,9 @@ def _bytes(path: Path, name: str) -> bytes:
     """Of a list or a picture: neither is so large that it would have to be read in parts."""
     inside = open(path / name, "rb") if path.is_dir() else None
     with inside or text.opened(path, f"{_folder_in(path)}{name}") as stream:
-        content = stream.read(MOST + 1)
-    if len(content) > MOST:
-        raise RecordingError(f"{path}, {name}: is larger than {MOST >> 20} MB: it is damaged")
+        content = stream.read(MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        raise RecordingError(f"{path}, {name}: is larger than {MAX_BYTES >> 20} MB: it is damaged")
     return content
 
 

@@ -29,8 +29,9 @@ import pyarrow as pa
 import pyarrow.csv
 
 from firenet_jax.errors import RecordingError, logger
-from firenet_jax.events import REACH, Events, Rows
+from firenet_jax.events import Events, Rows
 from firenet_jax.readers import Source, reading, to_events
+from firenet_jax.settings import LONGEST_SIDE
 
 BLOCK = 1 << 21  # bytes parsed at once: about 90,000 events
 HEAD = 1 << 16  # bytes from which the layout is told
@@ -52,8 +53,8 @@ UNITS = {  # microseconds
 WORDS = "no one two three four five six seven eight nine ten".split()
 EXPECTED = {
     "t": ("the time", "a number of seconds"),
-    "x": ("x", f"a whole number below {REACH}"),
-    "y": ("y", f"a whole number below {REACH}"),
+    "x": ("x", f"a whole number below {LONGEST_SIDE}"),
+    "y": ("y", f"a whole number below {LONGEST_SIDE}"),
     "p": ("the polarity", "0 or 1"),
 }
 
@@ -220,7 +221,7 @@ def other_order(columns: np.ndarray) -> str | None:
     signs = [set(column.tolist()) in ({0, 1}, {-1, 1}) for column in columns]
     times = [
         (np.diff(column) >= 0).all()
-        and (column.max() >= REACH or (column != np.rint(column)).any())
+        and (column.max() >= LONGEST_SIDE or (column != np.rint(column)).any())
         for column in columns
     ]
     if sum(signs) != 1 or sum(times) != 1 or (times[0] and signs[3]):

@@ -1,9 +1,9 @@
 """Textures and camera motion -> intensity video and its optical flow, as pure functions of time.
 
-A scene is a textured plane under a camera that moves with six degrees of freedom, as in the
-paper, and several textured objects before it, each a plane of its own with its own motion and
-outline; the nearer hides the farther. Nothing is simulated step by step: `render` and `flow` give
-the picture and the exact displacement at any times, so frames can be as dense as a sensor asks.
+A scene is a textured plane before a camera that moves with six degrees of freedom, as in the
+paper, and several textured objects in front of it, each a plane with its own motion and outline;
+nearer objects hide farther ones. Nothing is simulated step by step: `render` and `flow` give the
+picture and the exact displacement at any time, so frames can be as dense as a sensor needs.
 
 Times are seconds since the scene's start, float32, which tells microseconds apart for about a
 minute. Images are (H, W) float32 in [0, 1], grey values as they stand in picture files (the
@@ -27,7 +27,7 @@ from firenet_jax.settings import check_range
 from firenet_jax.warp import sample
 
 WAVES = 3  # sinusoids in each of the six coordinates of a motion
-PAUSES = 2  # at most so many stops in a scene
+PAUSES = 2  # greatest number of stops in a scene
 OUTLINE = 96  # cells on a side of an object's outline
 MARGIN = 1.3  # the outline's field reaches so many radii from the centre
 BLUR = 4  # pixels of the blurring kernel on each side of its middle
@@ -38,43 +38,42 @@ class SceneSettings:
     """What random scenes look like. Pairs are (least, greatest)."""
 
     objects: int = 3
-    """Objects before the background; a scene shows between none and all of them."""
+    """Greatest number of objects in front of the background; a scene shows 0 to all of them."""
     speed: tuple[float, float] = (3.0, 1000.0)
     """Pixels per second of the fastest point at its fastest time, drawn log-uniformly."""
     pause: float = 0.3
-    """How probable it is that everything stands still for a while, in each half of the scene."""
+    """Probability that everything stands still for a while, in each half of the scene."""
     halt: float = 0.0
-    """How probable it is that everything stops for good, in the first third of the scene: what was
-    seen must stay, however long nothing follows."""
+    """Probability that everything stops for good in the first third of the scene, to teach the
+    network to remember."""
     still: float = 0.0
-    """How probable it is that the camera stands still all the time, where there are objects to
-    move before it."""
+    """Probability that the camera stands still all the time, if the scene has objects."""
     plain: float = 0.0
-    """How probable it is that the background is one grey, where there are objects before it: what
-    passes such a background must leave no trail."""
+    """Probability that the background is plain grey, if the scene has objects, to teach the network
+    that objects leave no trail."""
     zoom: tuple[float, float] = (0.45, 1.1)
-    """Pixels of the image for one pixel of a texture, drawn log-uniformly for each plane. Textures
-    are blurred for that scale, so small ones do not flicker; above 1 they look unsharp."""
+    """Image pixels per texture pixel, drawn log-uniformly for each plane. Textures are blurred for
+    that scale, so small ones do not flicker; above 1 they look blurred."""
     blur: tuple[float, float] = (0.5, 0.5)
-    """Standard deviation of the optics' blur in pixels of the image, drawn log-uniformly for each
-    scene; below 0.5 the finest texture flickers."""
+    """Standard deviation of the optics' blur in image pixels, drawn log-uniformly for each scene;
+    below 0.5 the finest texture flickers."""
     tilt: float = 0.3
-    """Radians by which planes lean away from the camera, at most."""
+    """Greatest tilt of a plane in radians."""
     size: tuple[float, float] = (0.08, 0.3)
-    """Radius of the objects, in parts of the picture's larger side."""
+    """Radius of the objects, relative to the picture's larger side."""
     softness: tuple[float, float] = (1.0, 3.0)
-    """Pixels over which an object's edge fades; drawn log-uniformly, 1 is a sharp edge."""
+    """Pixels over which an object's edge fades, drawn log-uniformly; 1 is a sharp edge."""
     black: tuple[float, float] = (0.0, 0.08)
-    """Intensity of a texture's 0."""
+    """Intensity of black in a texture."""
     white: tuple[float, float] = (0.85, 1.0)
-    """Intensity of a texture's 1."""
+    """Intensity of white in a texture."""
     gamma: tuple[float, float] = (0.8, 1.25)
-    """Exponent applied to a texture's values, drawn log-uniformly."""
+    """Gamma of a texture's values, drawn log-uniformly."""
     hdr: float = 0.0
-    """How probable it is that a scene lies partly in deep shadow, 10 to 100 times darker."""
+    """Probability that part of a scene lies in deep shadow, 10 to 100 times darker."""
 
     def __post_init__(self):
-        """Raises SettingsError for numbers that no scene has."""
+        """Raises SettingsError for invalid values."""
         for name in ("speed", "zoom", "blur", "size", "softness", "gamma"):
             check_range(name, getattr(self, name))
         for name in ("pause", "halt", "still", "plain", "hdr"):

@@ -1,21 +1,22 @@
 """Intensity video -> events, or event tensors directly on the device: ESIM's sensor, with faults.
 
-One model, two outputs which agree: `event_list` gives time-sorted `Events` on the host, `simulate`
-event tensors that never leave the device. Both call `step` for each rendering of the scene:
+One model with two equivalent outputs: `event_list` yields time-sorted `Events` on the host,
+`simulate` gives event tensors on the device. Both call `step` for each rendering of the scene:
 
     L = log(0.001 + I);  a pixel emits an event, p = +1 or -1, each time L, taken as linear between
     two renderings, crosses reference + p C_p; the reference moves by p C_p, also when the
     refractory period swallows the event. Shot noise fires ON and OFF in turn, whatever L does.
 
-(Rebecq et al., "ESIM: an open event camera simulator", CoRL 2018.) L being linear, the events of a
-pixel between two renderings are equally spaced, and so are those that the refractory period
-leaves: a `Run`. Times are whole microseconds, as sensors stamp them. On the device they count from
-the interval's start, in integers of 1/1024 us, which both outputs round alike; an interval may
-last two seconds. (What crosses in the last half microsecond of a window is stamped with its end:
-the tensor on the device counts it there, who cuts the list into [start, end) in the next window.)
+(Rebecq et al., "ESIM: an open event camera simulator", CoRL 2018.) Because L is linear, the events
+of a pixel between two renderings are equally spaced, and so are those left by the refractory
+period: a `Run`. Time stamps are whole microseconds, as in real sensors. On the device times count
+from the start of the interval in units of 1/1024 us; both outputs round them alike, and an interval
+may last two seconds. (An event in the last half microsecond of a window is stamped with the
+window's end. The tensor on the device includes it; cutting the list into [start, end) puts it into
+the next window.)
 
-Images are (H, W) float32 in [0, 1]; sensors, states and runs are of one sequence, and `jax.vmap`
-makes batches of them.
+Images are (H, W) float32 in [0, 1]. Sensors, states and runs are those of one sequence; `jax.vmap`
+makes batches.
 """
 
 import dataclasses
@@ -36,18 +37,19 @@ from firenet_jax.settings import check_range
 from firenet_jax.simulation.scenes import Scene, SceneSettings, flow, random_scene, render
 
 EPS = 0.001
-THRESHOLD, SPREAD, REFRACTORY = 0.18, 0.03, 1e-3  # as in the paper, where nothing is said
-NOISE_IN_LIGHT = 0.25  # of that in the dark
-TICKS = 1024  # in a microsecond
-AT_ONCE = 4  # events of a pixel in one pass over the picture: fewer passes, less memory traffic
-LONGEST = 2**31 // TICKS - 1  # microseconds between two renderings
-SLOW, SWIFT = (0.02, 0.3), (16.0, 90.0)  # pixels a window, of rare sequences
-UNEVEN = 4.0  # times the mismatch of others: pixels of one edge fire one by one, not together
-# Of the slow ones: next to no faults, so that single events can be trusted.
+THRESHOLD, SPREAD, REFRACTORY = 0.18, 0.03, 1e-3  # defaults, as in the paper
+NOISE_IN_LIGHT = 0.25  # times the noise in the dark
+TICKS = 1024  # per microsecond
+EVENTS_PER_PASS = 4  # of a pixel, in one pass over the picture: saves memory traffic
+MAX_INTERVAL = 2**31 // TICKS - 1  # microseconds between two renderings
+SLOW, SWIFT = (0.02, 0.3), (16.0, 90.0)  # pixels per window, in slow and swift sequences
+# Slow sequences have this many times the mismatch, so that the pixels of an edge fire one by one.
+SLOW_MISMATCH = 4.0
+# Share of the slow sequences with hardly any faults, so that single events can be trusted.
 NEARLY_NOISELESS = 2 / 3
-# Of those that stop for good half have noise, so many events per pixel and window, as much in light
-# as in the dark: windows of a count hold nothing else then, and it says nothing of what is seen.
-# Half of it draws its signs: then it adds up to what looks like contrast, and is none.
+# Half of the sequences that stop for good have this much noise, in events per pixel and window,
+# equal in light and dark: at rest, windows with a fixed number of events hold nothing but noise. In
+# half of these the polarities are random instead of alternating: their sums look like contrast.
 AT_REST = (0.02, 1.0)
 
 
@@ -64,47 +66,48 @@ def _on(fault: Fault | None) -> TypeGuard[Fault]:
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """The sensor; as it stands the paper's, without faults. Pairs are (least, greatest), drawn
-    log-uniformly for each sequence. A fault is off where it is 0, and where nothing is said, unless
-    all faults are asked for.
+    """The sensor: by default that of the paper, without faults. Pairs are (least, greatest), drawn
+    log-uniformly for each sequence. A fault is off if it is 0 or not given, unless all faults are
+    on.
     """
 
     threshold: float | None = None
-    """Mean of the contrast thresholds, in log intensity; 0.18 where nothing is said."""
+    """Mean of the contrast thresholds, in log intensity (default: 0.18)."""
     threshold_spread: float | None = None
-    """Standard deviation of the thresholds, ON and OFF each drawn once for a sequence; 0.03 where
-    nothing is said."""
+    """Standard deviation of the thresholds; ON and OFF are each drawn once per sequence (default:
+    0.03)."""
     threshold_range: tuple[float, float] | None = None
-    """Draw the ON threshold log-uniformly from here instead, and OFF about as large."""
+    """Draw the ON threshold log-uniformly from this range instead, and OFF near it."""
     asymmetry: float = 0.1
-    """Standard deviation of OFF in parts of ON, where they are drawn from the threshold range: a
-    pixel that was darker for a while does not count back to where it was."""
+    """With a threshold range: standard deviation of the OFF threshold, relative to ON. Then ON and
+    OFF events do not cancel exactly."""
     refractory: float | None = None
-    """Seconds after an event in which a pixel stays silent; 0.001 where nothing is said."""
+    """Refractory period in seconds (default: 0.001)."""
     refractory_range: tuple[float, float] | None = None
-    """Draw it log-uniformly from here instead, once for a sequence."""
+    """Draw the refractory period log-uniformly from this range instead, once per sequence."""
     mismatch: float | None = None
-    """Standard deviation of each pixel's own thresholds, in log intensity; about 0.03 in life."""
+    """Standard deviation of the thresholds between pixels, in log intensity; about 0.03 in real
+    sensors."""
     noise: tuple[float, float] | None = None
-    """Shot noise: events per second of a pixel in the dark; in full light a quarter as many. They
-    are ON and OFF in turn, since what noise adds it takes away again. At most one of a pixel
-    between two renderings."""
+    """Shot noise: events per second of a pixel in the dark; in full light a quarter as many. ON and
+    OFF alternate. At most one per pixel between two renderings."""
     leak: tuple[float, float] | None = None
-    """ON events per second by which every pixel's reference drifts, about 0.1 in sensors."""
+    """Leak: ON events per second by which every pixel's reference drifts; about 0.1 in real
+    sensors."""
     hot: tuple[float, float] | None = None
-    """Part of the pixels that are hot: 10 to 500 events per second, ON or OFF, without end."""
+    """Share of hot pixels, which fire 10 to 500 events per second, all ON or all OFF."""
     cutoff: tuple[float, float] | None = None
-    """Hertz: bandwidth of the pixels, a first-order low-pass on log intensity."""
+    """Bandwidth of the pixels in hertz: a first-order low-pass filter on log intensity."""
     cutoff_dark: float = 0.1
-    """Bandwidth in the dark, in parts of that in full light; 1: it depends on no light."""
+    """Bandwidth in the dark, relative to full light; 1: independent of light."""
     clean: float = 0.0
-    """Part of the sequences whose sensor has none of these faults, and the paper's thresholds."""
+    """Share of the sequences with the paper's thresholds and none of these faults."""
     mid_recording: bool = False
-    """The sensor has run before: each pixel's reference begins anywhere within a threshold of the
-    first rendering, instead of on it."""
+    """Start in the middle of a recording: each pixel's reference is anywhere within a threshold of
+    the first rendering, instead of equal to it."""
 
     def __post_init__(self):
-        """Raises SettingsError for numbers that no sensor has."""
+        """Raises SettingsError for invalid values."""
         for name in ("threshold_range", "refractory_range"):
             if getattr(self, name) is not None:
                 check_range(name, getattr(self, name))
@@ -121,7 +124,7 @@ class SensorSettings:
             value = getattr(self, name)
             if value is not None and not (value >= 0 and math.isfinite(value)):
                 raise SettingsError(f"{name} is {value}, but must be 0 or more")
-        # A range wins, so what is given beside it would silently do nothing.
+        # A range takes precedence, so the other value would silently be ignored.
         for name, owner in (
             ("threshold", "threshold_range"),
             ("threshold_spread", "threshold_range"),
@@ -142,11 +145,11 @@ FAULTY = SensorSettings(
     hot=(1e-4, 1e-3),
     cutoff=(100.0, 1000.0),
 )
-"""Everything on, as much as real sensors show."""
+"""All faults, as strong as in real sensors."""
 
 
 def with_faults(sensor: SensorSettings) -> SensorSettings:
-    """FAULTY, but with what these settings say about a fault, and otherwise about the sensor."""
+    """FAULTY, overridden by everything that these settings change from their defaults."""
     plain = SensorSettings()
     chosen = {
         field.name: getattr(sensor, field.name)
@@ -159,29 +162,29 @@ def with_faults(sensor: SensorSettings) -> SensorSettings:
 
 
 class Sensor(NamedTuple):
-    """The sensor of one sequence; a fault that is off is None, and costs nothing."""
+    """The sensor of one sequence. A fault that is off is None and costs nothing."""
 
     on: jax.Array  # () or (H, W) threshold in log intensity
     off: jax.Array
     refractory: jax.Array | None  # () int32, ticks
-    drift: jax.Array | None  # (H, W) log intensity per second, by which L seems to rise
-    noise: jax.Array | None  # (3,) events per second and pixel in the dark, part of it in full
-    # light, and 1 where its signs are drawn, 0 where they alternate
-    cutoff: jax.Array | None  # (2,) hertz in full light, and the part of it left in the dark
-    phase: jax.Array | None  # (H, W) part of the first threshold already gone, where L drifts, and
-    # whether noise begins with ON: else all pixels would begin with the same event
+    drift: jax.Array | None  # (H, W) apparent rise of L in log intensity per second
+    noise: jax.Array | None  # (3,) events per second and pixel in the dark; factor in full light; 1
+    # if polarities are random, 0 if they alternate
+    cutoff: jax.Array | None  # (2,) hertz in full light; factor in the dark
+    phase: jax.Array | None  # (H, W) share of the first threshold already crossed where L drifts,
+    # and whether noise starts with ON; otherwise all pixels would start with the same event
     start: jax.Array | None  # (H, W) L above the reference at the first rendering
     key: jax.Array  # of the noise
 
 
 class SensorState(NamedTuple):
-    """What the pixels remember from one rendering to the next."""
+    """The state of the pixels between two renderings."""
 
     log: jax.Array  # (H, W) float32, L after the low-pass
     above: jax.Array  # (H, W) float32, L above the reference: small, so no rounding adds up
     silent: jax.Array | None  # (H, W) int32, ticks until the refractory period is over
-    noise_on: jax.Array | None  # (H, W) bool, whether noise fires ON next
-    renderings: jax.Array  # () int32, how many so far: they number the noise
+    noise_on: jax.Array | None  # (H, W) bool, whether the next noise event is ON
+    renderings: jax.Array  # () int32, how many so far; selects the random numbers of the noise
 
 
 class Run(NamedTuple):
@@ -254,7 +257,7 @@ def random_sensor(
 
 
 def _without_faults(sensor: Sensor, clean: jax.Array, spread: jax.Array) -> Sensor:
-    """The paper's sensor where `clean` () says so; spread: (2,) normal numbers."""
+    """The paper's sensor if `clean` () is True; spread: (2,) normal numbers."""
 
     def unless(value, fault):
         return None if fault is None else jnp.where(clean, value, fault)
@@ -267,7 +270,7 @@ def _without_faults(sensor: Sensor, clean: jax.Array, spread: jax.Array) -> Sens
         refractory=unless(refractory, sensor.refractory),
         drift=unless(0.0, sensor.drift),
         noise=unless(jnp.array([0.0, NOISE_IN_LIGHT, 0.0]), sensor.noise),
-        cutoff=unless(jnp.array([1e9, 1.0]), sensor.cutoff),  # so high that nothing is lost
+        cutoff=unless(jnp.array([1e9, 1.0]), sensor.cutoff),  # so high that it has no effect
     )
 
 
@@ -285,7 +288,7 @@ def first_state(sensor: Sensor, image: jax.Array) -> SensorState:
     if sensor.start is not None:
         above = sensor.start
     silent = None if sensor.refractory is None else jnp.zeros(image.shape, jnp.int32)
-    # A later bit of the phase than those that say when a pixel leaks.
+    # From a lower bit of the phase, independent of when a pixel leaks.
     noise_on = None
     if sensor.noise is not None and sensor.phase is not None:
         noise_on = sensor.phase * 1024 % 2 < 1
@@ -297,7 +300,7 @@ def step(
 ) -> tuple[SensorState, tuple[Run, ...]]:
     """A rendering (H, W), `duration` microseconds (int32) after the last -> (state, its events).
 
-    One run of each pixel's crossings, and a second one of shot noise where there is any.
+    One run of each pixel's crossings and, with shot noise, a second one of that.
     """
     seconds = 1e-6 * duration.astype(jnp.float32)
     ticks = TICKS * duration  # int32
@@ -309,7 +312,7 @@ def step(
 
     rise = after - before
     if sensor.drift is not None:
-        rise = rise + seconds * sensor.drift  # seen from a reference that sinks, L rises
+        rise = rise + seconds * sensor.drift  # relative to a sinking reference, L rises
 
     up = rise > 0
     polarity = jnp.where(up, 1.0, -1.0)
@@ -317,7 +320,7 @@ def step(
     above = state.above + rise
     crossings = jnp.maximum(jnp.floor(polarity * above / threshold), 0.0)
     size = jnp.abs(rise)
-    size = jnp.where(size > 0, size, 1.0)  # no rise, no crossing: anything finite will do
+    size = jnp.where(size > 0, size, 1.0)  # without a rise, nothing crosses: any finite value
     scale = ticks.astype(jnp.float32) / size
     # The first crossing, from the interval's start; rounding may put it a little outside. The
     # spacing is rounded down, so that the last crossing stays inside.
@@ -337,7 +340,7 @@ def step(
         rate, light, drawn = sensor.noise
         expected = seconds * rate * (1 - (1 - light) * image)
         bits = jax.random.bits(key, image.shape, jnp.uint32)
-        # The lowest bit has no part in when it fires: that is a float32, of 24 bits.
+        # The time of the event uses the upper 24 bits, so the lowest bit is independent of it.
         noise_on = jnp.where(drawn > 0, bits % 2 == 1, noise_on)
         noise = _shot_noise(bits, expected, jnp.where(noise_on, 1.0, -1.0), ticks)
         noise_on = noise_on ^ (noise.count > 0)
@@ -346,10 +349,10 @@ def step(
 
 
 def _refractory(run: Run, silent: jax.Array, refractory: jax.Array, ticks: jax.Array):
-    """All crossings -> those at which the pixel may speak, and for how long it is silent then.
+    """All crossings -> those that become events, and the silence left at the interval's end.
 
-    Of equally spaced crossings the first one after the silence speaks, and then each n-th, n the
-    least with n spacings not shorter than the refractory period: again equally spaced.
+    Of equally spaced crossings the first one after the silence becomes an event, and then every
+    n-th, for the least n whose n spacings cover the refractory period: again equally spaced.
     """
     spacing = jnp.maximum(run.spacing, 1).astype(jnp.float32)
     wait = jnp.maximum(silent - run.first, 0).astype(jnp.float32)
@@ -357,7 +360,7 @@ def _refractory(run: Run, silent: jax.Array, refractory: jax.Array, ticks: jax.A
     stride = jnp.maximum(jnp.ceil(refractory.astype(jnp.float32) / spacing), 1.0)
     left = jnp.maximum(run.count.astype(jnp.float32) - skipped, 0.0)
     count = jnp.ceil(left / stride).astype(jnp.int32)
-    # Numbers that belong to no event may be large: they must not leave int32.
+    # Values of non-events may be large: keep them within int32.
     first = jnp.where(count > 0, skipped, 0.0).astype(jnp.int32) * run.spacing + run.first
     spacing = jnp.where(count > 1, stride, 0.0).astype(jnp.int32) * run.spacing
     last = first + (count - 1) * spacing
@@ -366,16 +369,16 @@ def _refractory(run: Run, silent: jax.Array, refractory: jax.Array, ticks: jax.A
 
 
 def _shot_noise(bits: jax.Array, expected: jax.Array, polarity: jax.Array, ticks: jax.Array) -> Run:
-    """At most one event a pixel and interval, at any time in it; expected: (H, W) events; bits:
+    """At most one event per pixel and interval, at any time in it; expected: (H, W) events; bits:
     (H, W) uint32, random.
 
-    Its rate falls with light as in Hu, Liu and Delbruck, "v2e", CVPRW 2021. It moves a reference,
-    as there, but one of its own: were it that of L, its polarity would hang on the last bits of L,
-    and a batch on the devices that compute it. It does not wait for the refractory period. One
-    random number decides all: where it is below the probability, it is uniform below it.
+    The rate falls with light as in Hu, Liu and Delbruck, "v2e", CVPRW 2021. There noise moves the
+    pixel's reference; here it has a reference of its own, because otherwise its polarity would
+    depend on the last bits of L, and so on the device. It ignores the refractory period. One random
+    number decides everything: if it is below the probability, it is uniform below it.
     """
-    # Not that of at least one event of a Poisson process, 1 - exp(-expected): as no interval has
-    # more than one, the rate that was asked for would be missed by a quarter at 0.6.
+    # Not 1 - exp(-expected), the probability of at least one event of a Poisson process: with at
+    # most one event per interval the rate would be a quarter too low at 0.6.
     chance = jnp.minimum(expected, 1.0)
     number = bits.astype(jnp.float32) * 2.0**-32
     fires = number < chance
@@ -401,9 +404,8 @@ def _listed(sensor, state, image, duration):
 def event_list(sensor: Sensor, renderings: Iterable[tuple[int, ArrayLike]]) -> Iterator[Events]:
     """(microseconds, image (H, W)) in time order -> chunks of time-sorted events, one per interval.
 
-    The first rendering gives no events. How dense renderings must be is said by
-    `scenes.rendering_times`. Raises SettingsError where time does not advance, or by more than two
-    seconds.
+    The first rendering gives no events. `scenes.rendering_times` says how dense renderings must be.
+    Raises SettingsError if time does not advance, or by more than two seconds.
     """
     state, previous = None, 0
     for time, image in renderings:
@@ -412,10 +414,10 @@ def event_list(sensor: Sensor, renderings: Iterable[tuple[int, ArrayLike]]) -> I
             state, previous = _first(sensor, image), time
             continue
         duration = time - previous
-        if not 0 < duration <= LONGEST:
+        if not 0 < duration <= MAX_INTERVAL:
             raise SettingsError(
                 f"renderings at {previous} and {time} us: each must come after the last, by at "
-                f"most {LONGEST} us"
+                f"most {MAX_INTERVAL} us"
             )
         state, runs, fired = _listed(sensor, state, image, jnp.int32(duration))
         if int(fired):
@@ -481,8 +483,8 @@ def simulate(
 
     bounds: (T + 1, B) int32, microseconds since the scenes' start; window t lasts from t to t + 1.
     state: what the last call returned, to go on where it ended; None starts afresh.
-    renderings: so many in each window, equally spaced. Nothing moves by more than a pixel from one
-    to the next where windows last at most renderings / scene.speed seconds.
+    renderings: number in each window, equally spaced. Nothing moves by more than a pixel between
+    two if windows last at most renderings / scene.speed seconds.
     """
     draw = partial(_draw, height=height, width=width)
     move = jax.vmap(partial(flow, height=height, width=width))
@@ -490,8 +492,8 @@ def simulate(
     if state is None:
         state = first_states(sensors, scenes, bounds[0], height=height, width=width)
 
-    # The renderings of a window are a loop of their own: unrolled, they compile twice as long.
-    span = min(-(-(BINS - 1) // renderings) + 2, BINS)  # bins that the votes of one can reach
+    # A loop over the renderings of a window: unrolled, they take twice as long to compile.
+    span = min(-(-(BINS - 1) // renderings) + 2, BINS)  # bins that votes of one rendering reach
 
     def window(state, ends):
         start, end = ends  # (B,)
@@ -519,9 +521,9 @@ def simulate(
 def _votes(planes: jax.Array, low, runs, passed: jax.Array, total: jax.Array) -> jax.Array:
     """Adds the votes of runs (B, H, W) by Eq. 1 to planes (n, B, H, W), the bins from `low` on.
 
-    passed: (B,) int32, microseconds from the window's start to the interval's; total: those that
-    the window lasts. Events of a pixel are taken one after the other, all pixels at once, until
-    the busiest has no more.
+    passed: (B,) int32, microseconds from the window's start to the interval's; total: duration of
+    the window. Events of a pixel are processed one after the other, all pixels in parallel, up to
+    the count of the busiest one.
     """
     passed, total = passed[:, None, None], total[:, None, None]
     scale = (BINS - 1) / total.astype(jnp.float32)
@@ -540,19 +542,19 @@ def _votes(planes: jax.Array, low, runs, passed: jax.Array, total: jax.Array) ->
 
     def several(carry):
         number, planes = carry
-        for n in range(AT_ONCE):
+        for n in range(EVENTS_PER_PASS):
             planes = vote(planes, first, number + n)
-        return number + AT_ONCE, planes
+        return number + EVENTS_PER_PASS, planes
 
     start = jnp.int32(0), list(planes)
     _, voted = jax.lax.while_loop(lambda carry: carry[0] < most, several, start)
-    for run in runs[1:]:  # noise: one event at most
+    for run in runs[1:]:  # noise: at most one event
         voted = vote(voted, run, 0)
     return jnp.stack(voted)
 
 
 def check_rare(slow: float, swift: float) -> None:
-    """Raises SettingsError where these are no parts of the sequences, or leave `motion` none."""
+    """Raises SettingsError unless these are shares, and less than 1 together."""
     if not (slow >= 0 and swift >= 0 and slow + swift < 1):
         raise SettingsError(
             f"slow is {slow} and swift is {swift}, but they are parts of the sequences: 0 or more, "
@@ -591,17 +593,17 @@ def random_setups(
 ) -> tuple[Sensor, Scene, jax.Array]:
     """key, textures (N, S, S) -> sensors, scenes, durations: B random setups for `simulate`.
 
-    durations: (B,) int32 microseconds, what each window of a sequence lasts: so that at its fastest
-    time the fastest point moves by so many pixels as `motion` says (least, greatest; log-uniform),
-    but 1 to 300 ms.
-    windows: in a sequence, over which pauses are placed and the speed is measured.
-    slow, swift: parts of the sequences in which next to nothing moves (`SLOW` pixels a window, the
-    pixels' thresholds differ `UNEVEN` times as much, and most have a fiftieth of noise and leaks),
-    and in which much does before a blank ground
-    (`SWIFT` pixels, from one rendering to the next by more than one).
+    durations: (B,) int32 microseconds of each sequence's windows, 1 to 300 ms: such that at its
+    fastest time the fastest point moves by `motion` pixels per window (least, greatest;
+    log-uniform).
+    windows: number per sequence, over which pauses are placed and the speed is measured.
+    slow: share of the sequences with hardly any motion: `SLOW` pixels per window, `SLOW_MISMATCH`
+    times the mismatch, and in most of them a fiftieth of the noise and leaks.
+    swift: share of the sequences with very fast motion (`SWIFT` pixels per window, more than one
+    between renderings) over a plain background.
     Where the sensor has noise, half of the scenes that stop for good are noisy (`AT_REST`).
-    Raises SettingsError where `motion` is more than a pixel from one rendering to the next, the
-    bound of Gehrig et al., "Video to Events", CVPR 2020, or slow and swift leave nothing.
+    Raises SettingsError if `motion` is more than a pixel between two renderings, the bound of
+    Gehrig et al., "Video to Events", CVPR 2020, or if slow and swift are not valid shares.
     """
     if motion[1] > renderings:
         raise SettingsError(
@@ -646,7 +648,7 @@ def _paces(
     slow: float,
     swift: float,
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """(2, B) uniform numbers -> pixels per second, duration of a window, which are slow or swift;
+    """(2, B) uniform numbers -> pixels per second, window duration, whether slow, whether swift;
     (B,) each. The other arguments are those of `random_setups`."""
 
     def log_uniform(bounds, numbers):
@@ -665,8 +667,8 @@ def _paces(
 
 
 def _uneven(sensors: Sensor, kind: jax.Array, is_slow: jax.Array, slow: float) -> Sensor:
-    """Thresholds of a slow sequence's pixels differ more, and most have next to no noise."""
-    apart = jnp.where(is_slow, UNEVEN, 1.0)[:, None, None]
+    """Slow sequences get more threshold mismatch, and most of them hardly any noise."""
+    apart = jnp.where(is_slow, SLOW_MISMATCH, 1.0)[:, None, None]
 
     def uneven(thresholds):
         mean = thresholds.mean((-2, -1), keepdims=True)
@@ -685,7 +687,7 @@ def _uneven(sensors: Sensor, kind: jax.Array, is_slow: jax.Array, slow: float) -
 def _noisy_at_rest(
     key: jax.Array, noise: jax.Array, scenes: Scene, windows: int | jax.Array, duration: jax.Array
 ) -> jax.Array:
-    """The sensors' noise, but that of `AT_REST` for half of the sequences that stop for good."""
+    """The sensors' noise, replaced by that of `AT_REST` in half of the sequences that stop."""
     seconds = 1e-6 * duration
     stopped = scenes.pauses[:, 0, 1] - scenes.pauses[:, 0, 0] > windows * seconds
     low, high = (math.log(bound) for bound in AT_REST)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-EVERY = 60.0  # seconds between two lines where there is no terminal
+SECONDS_PER_LINE = 60.0  # seconds between two lines where there is no terminal
 LINE = "{desc}{percentage:.0f} %, {elapsed} passed, {remaining} left, {rate_fmt}{postfix}"
 LINE_OF_UNKNOWN = "{desc}{n_fmt} {unit}, {elapsed} passed, {rate_fmt}{postfix}"
 
@@ -20,11 +20,12 @@ class _Lines(tqdm):
     def __init__(self, *args, **choices):
         self.said = time.monotonic()
         known = choices.get("total") is not None
-        choices |= {"bar_format": LINE if known else LINE_OF_UNKNOWN, "mininterval": EVERY}
+        choices |= {"bar_format": LINE if known else LINE_OF_UNKNOWN}
+        choices |= {"mininterval": SECONDS_PER_LINE}
         super().__init__(*args, **choices, miniters=1, maxinterval=math.inf, file=sys.stderr)
 
     def display(self, msg: str | None = None, pos: int | None = None) -> bool:
-        if time.monotonic() - self.said >= EVERY:
+        if time.monotonic() - self.said >= SECONDS_PER_LINE:
             self.said = time.monotonic()
             print(f"firenet: {msg or self}", file=sys.stderr, flush=True)
         return True

@@ -11,8 +11,8 @@ import numpy as np
 
 from firenet_jax.storage.files import OutputError
 
-BETWEEN = 1 / 60  # seconds between two pictures at least
-SMALLEST = 480  # pixels of the window's width: smaller pictures are enlarged
+MIN_INTERVAL = 1 / 60  # seconds between two pictures at least
+MIN_WIDTH = 480  # pixels of the window's width: smaller pictures are enlarged
 
 
 class Screen:
@@ -38,18 +38,18 @@ class Screen:
             ) from error
         self.label, self.image, self.tk = tkinter.Label(self.window), None, tkinter
         self.label.pack()
-        self.last = -BETWEEN
+        self.last = -MIN_INTERVAL
         self.window.protocol("WM_DELETE_WINDOW", self.close)
 
     def show(self, picture: np.ndarray, title: str) -> None:
         """A picture (H, W) or (H, W, 3) uint8. Returns at once, also where the window is closed."""
-        if self.window is None or time.monotonic() - self.last < BETWEEN:
+        if self.window is None or time.monotonic() - self.last < MIN_INTERVAL:
             return
         height, width = picture.shape[:2]
         header = f"P{5 if picture.ndim == 2 else 6} {width} {height} 255\n".encode()
         with contextlib.suppress(self.tk.TclError):  # closed meanwhile
             image = self.tk.PhotoImage(master=self.window, data=header + picture.tobytes())
-            self.image = image.zoom(-(-SMALLEST // width)) if width < SMALLEST else image
+            self.image = image.zoom(-(-MIN_WIDTH // width)) if width < MIN_WIDTH else image
             self.label.configure(image=self.image)
             self.window.title(title)
             self.window.update()

@@ -1,11 +1,11 @@
 """Sequences -> weights: the loss, batches from files, the jitted step, a run that resumes.
 
-    losses         Eq. 2 of the paper, with the distances that it may be made of
+    losses         Eq. 2 of the paper, and the distances that it can use
     batches        HDF5 sequences -> batches, augmented
     step           (parameters, data) -> parameters: simulate, scan, differentiate, update
-    settings       what `firenet train` asks for
+    settings       the options of `firenet train`
     log            losses, pictures and weights of a run, on disk
-    run            all of these together, in a folder where it goes on
+    run            all of these together, in a folder from which a run resumes
 
 Read `step.train_step` first.
 """

@@ -1,14 +1,14 @@
-"""A folder of HDF5 sequences -> batches for training: what `sensor.simulate` gives, from files.
+"""A folder of HDF5 sequences -> batches for training, of the same type as `sensor.simulate`.
 
-The files are of event_cnn_minimal's layout (see `dataset`): `firenet simulate` writes it, and the
-sets of event_cnn_minimal and ssl_e2vid come in it. Window t of a batch lasts from one image of a
-file to the next, start <= time < end, and these two times are its t_min and t_max in Eq. 1 (see
-`tensors`); `images[t]` is the image at its end. The displacement is the flow stored with that
+The files have the layout of event_cnn_minimal (see `commands.simulate`), which `firenet simulate`
+writes and the data sets of event_cnn_minimal and ssl_e2vid use. Window t of a batch lasts from one
+image of a file to the next, start <= time < end; these two times are its t_min and t_max in Eq. 1
+(see `tensors`). `images[t]` is the image at its end. The displacement is the flow stored with that
 image times the window's duration, so that `warp(images[t - 1], displacement[t])` is `images[t]`
-where `visible[t]`. Without flow in the file nothing is visible, and the temporal loss sees nothing.
+where `visible[t]`. Without flow in the file nothing is visible, and the temporal loss is 0.
 
-Batch n depends on the files, the settings, the seed and n alone: a run that goes on at batch n
-is the run that was not interrupted. Threads read ahead; events become tensors on the device.
+Batch n depends only on the files, the settings, the seed and n, so a resumed run continues exactly.
+Threads read ahead; events become tensors on the device.
 """
 
 import hashlib
@@ -33,28 +33,27 @@ from firenet_jax.tensors import Packed, pack, voxelise
 from firenet_jax.warp import warp
 
 SUFFIXES = (".h5", ".hdf5")
-ONE_IN = 20  # of so many files one is for validation, as in the paper
-THREADS, AHEAD = 2, 4  # that read, and batches that wait; HDF5 lets one thread in at a time
+FILES_PER_VALIDATION = 20  # one file in twenty is for validation, as in the paper
+THREADS, AHEAD = 2, 4  # reading threads and waiting batches; HDF5 runs one thread at a time
 
 
 @dataclass(frozen=True)
 class Augment:
-    """What each run of windows is changed by, besides its crop. Pauses and hot pixels as in the
-    training of FireNet+ (Stoffregen et al. 2020). Contrast thresholds vary in the sets themselves.
+    """Augmentation of sequences, besides cropping. Pauses and hot pixels as in the training of
+    FireNet+ (Stoffregen et al. 2020). Contrast thresholds vary in the data sets themselves.
     """
 
     flip: float = 0.5
-    """Probability of a flip, left to right and, drawn apart, top to bottom."""
+    """Probability of a horizontal flip and, independently, of a vertical flip."""
     pauses: float = 0.05
-    """Probability that the camera stops: a window without events, the image before again."""
+    """Probability that the camera stops: a window without events, and the same image again."""
     stay: float = 0.9
-    """Probability that a camera that stands still does so for another window."""
+    """Probability that a stopped camera stays so for another window."""
     hot_pixels: float = 1e-3
-    """Greatest share of hot pixels, whose value in all bins of a run is higher or lower by a
-    standard normal number."""
+    """Greatest share of hot pixels, to which a standard normal number is added in all bins."""
     voxel_noise: float = 0.0
-    """Standard deviation of normal noise in all entries of the tensors, also those of pauses. 0.1
-    in FireNet+, whose tensors were not normalised: normalised, a pause would be noise of 1."""
+    """Standard deviation of normal noise in all entries of the tensors, including pauses. FireNet+
+    used 0.1 without normalisation; with normalisation a pause would become noise of deviation 1."""
 
     def __post_init__(self):
         for name in ("flip", "pauses", "stay", "hot_pixels"):
@@ -64,7 +63,7 @@ class Augment:
             raise SettingsError(f"voxel_noise is {self.voxel_noise}, but must be 0 or more")
 
 
-NOTHING = Augment(flip=0.0, pauses=0.0, hot_pixels=0.0, voxel_noise=0.0)
+NO_AUGMENT = Augment(flip=0.0, pauses=0.0, hot_pixels=0.0, voxel_noise=0.0)
 """For validation."""
 
 
@@ -90,7 +89,7 @@ def find(folder: Path) -> list[Path]:
 
 
 def is_set(path: Path) -> bool:
-    """Whether this is a folder of sequences, and no recording."""
+    """Whether this is a folder of sequences rather than a recording."""
     return path.is_dir() and any(file.suffix.lower() in SUFFIXES for file in path.rglob("*"))
 
 
@@ -107,7 +106,7 @@ def split(folder: Path) -> tuple[list[Path], list[Path]]:
     held = [path for path in files if names[path].startswith("validation/")]
     if not held:
         order = sorted(files, key=lambda path: hashlib.sha256(names[path].encode()).digest())
-        held = sorted(order[: max(1, len(files) // ONE_IN)])
+        held = sorted(order[: max(1, len(files) // FILES_PER_VALIDATION)])
     kept = [path for path in files if path not in set(held)]
     if not kept:
         raise RecordingError(
@@ -160,7 +159,7 @@ def _index(path: Path) -> Index:
         images, stamps = file["images"], file["events/ts"]
         names = list(images)  # sorted by HDF5
         times = np.array([images[name].attrs["timestamp"] for name in names])
-        if not (np.diff(times) > 0).all():  # so put that NaN fails
+        if not (np.diff(times) > 0).all():  # in this form NaN fails too
             image = int(np.argmin(np.diff(times) > 0)) + 1
             raise RecordingError(
                 f"{path}, image {image}: its time is {times[image]}, not after {times[image - 1]}, "
@@ -174,7 +173,7 @@ def _index(path: Path) -> Index:
 
 
 def _stamps(path: Path, column: Any) -> Iterator[Events | Rows]:
-    """Events of which only the time is known."""
+    """Events with times only."""
     for start in range(0, len(column), CHUNK):
         t = column[start : start + CHUNK]
         nothing = np.zeros(len(t), np.int16)
@@ -250,8 +249,8 @@ def _example(
 
 
 def _pauses(numbers: np.ndarray, augment: Augment) -> np.ndarray:
-    """(N,) uniform random numbers -> (N,) bool, where the camera stands still; never at first,
-    when the network cannot know what it saw."""
+    """(N,) uniform random numbers -> (N,) bool, where the camera stands still; never in the first
+    window, before which the network has seen nothing."""
     paused = np.zeros(len(numbers), bool)
     for n in range(1, len(numbers)):
         paused[n] = numbers[n] < (augment.stay if paused[n - 1] else augment.pauses)

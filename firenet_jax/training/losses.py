@@ -4,10 +4,10 @@ Scheerlinck et al., "Fast Image Reconstruction with an Event Camera", WACV 2020:
 
     loss = sum_{k=0..L} L_R(k) + lambda_TC sum_{k=L0..L} L_TC(k)
 
-Sums over the images of a sequence, not means; the mean over the batch. L_TC is
-`metrics.temporal_error`. L_R was LPIPS, whose network has to be downloaded; here it is a weighted
-sum of distances that need nothing, by default about as large as LPIPS is for a good reconstruction
-(0.4 to 0.5), so that lambda_TC means the same.
+The loss is summed over the images of a sequence and averaged over the batch. L_TC is
+`metrics.temporal_error`. In the paper L_R is LPIPS, which needs a pretrained network. Here it is a
+weighted sum of distances that need none, by default about as large as LPIPS of a good
+reconstruction (0.4 to 0.5), so that lambda_TC has the same meaning.
 """
 
 import math
@@ -32,8 +32,8 @@ class Loss:
     l1: float = 1.0
     """Mean absolute difference."""
     centred: float = 0.0
-    """Mean absolute difference of images without their means: events tell no absolute brightness,
-    so most of its gradient is noise."""
+    """Mean absolute difference after subtracting each image's mean: events carry no absolute
+    brightness, so that most of the gradient of a difference of means is noise."""
     contrast: float = 0.0
     """Difference of the standard deviations; blind to a negative."""
     nlpd: float = 0.5
@@ -53,16 +53,15 @@ class Loss:
     equalised_mse: float = 0.0
     """Mean squared difference after a soft histogram equalisation."""
     detail: float = 0.0
-    """Difference between the local strengths of detail, of images before which next to nothing
-    moved: there the other distances prefer a blur to strokes that they cannot place. Blind to a
-    negative."""
+    """Difference between local strengths of detail, for images with hardly any motion before them:
+    there the other distances favour blur over slightly misplaced strokes. Blind to a negative."""
     random_features: float = 0.0
     """Distance between the features of a random network."""
     lambda_tc: float = 2.0
     """Weight of the temporal consistency."""
     l0: int = 10
-    """First image whose temporal consistency counts, because the state must warm up; 0 for a
-    sequence whose state is warm from the start."""
+    """First image whose temporal consistency counts, as the state must warm up first; 0 if the
+    state is warm from the start."""
     L: int = 20
     """Last image of a sequence, counted from 0."""
 
@@ -72,7 +71,7 @@ class Loss:
                 raise SettingsError(f"{name} is {getattr(self, name)}, but must be 0 or more")
 
 
-STILL = 0.3  # pixels by which nothing moves more before an image whose detail counts
+MAX_STILL_MOTION = 0.3  # pixels: `detail` counts for images after at most this much motion
 DISTANCES = {
     "l1": metrics.l1,
     "centred": metrics.centred,
@@ -112,11 +111,11 @@ def sequence_loss(
     images, truths: (T, B, H, W), image k is from the time of truth k, that of the last event.
     displacements: (T, B, H, W, 2) pixels, x then y, from image k-1 to k on the grid of k.
     visible: (T, B, H, W) bool, False where image k shows what image k-1 did not.
-    displacements[0] and visible[0] are used by `detail` alone: image 0 has no predecessor here.
+    Only `detail` uses displacements[0] and visible[0], as image 0 has no predecessor here.
     warm: () or (B,) bool, whether the state was warm before image 0, so that l0 does not apply.
 
-    loss: scalar. Terms: scalars, unweighted means over batch and images (only those that count,
-    for "temporal"), so that they compare between lengths; "reconstruction" is the mean of L_R:
+    loss: scalar. Terms: scalars, unweighted means over batch and images (for "temporal" over those
+    that count), so that different lengths are comparable; "reconstruction" is the mean of L_R:
 
         loss = T reconstruction + lambda_TC (T - max(l0, 1)) temporal
     """
@@ -128,12 +127,12 @@ def sequence_loss(
     per_image, terms = reconstruction_loss(images, truths, settings)
     if settings.detail:
         moved = jnp.where(visible, jnp.abs(displacements).max(-1), 0.0).max((-2, -1))
-        terms["detail"] = jnp.where(moved < STILL, metrics.detail(images, truths), 0.0)
+        terms["detail"] = jnp.where(moved < MAX_STILL_MOTION, metrics.detail(images, truths), 0.0)
         per_image += settings.detail * terms["detail"]
     terms = {"reconstruction": per_image, **terms}
     loss = per_image.sum(0).mean()
 
-    # Where `warm` is only known as the program runs, all are computed and some do not count.
+    # If `warm` is traced, all errors are computed and those that do not count are masked.
     known = isinstance(warm, bool)
     first = max(settings.l0, 1) if known and not warm else 1
     if settings.lambda_tc and first < steps:

@@ -1,14 +1,14 @@
-"""Settings -> weights: a run in a folder, which goes on where it was interrupted.
+"""Settings -> weights: a run in a folder, which can be interrupted and resumed.
 
-Step n is a function of the seed, n and the state alone (`step`), so a run that was interrupted and
-resumed is the run that was not. A run is a folder:
+Step n is a function of the seed, n and the state alone (`step`), so an interrupted and resumed run
+equals an uninterrupted one. A run is a folder:
 
-    settings.json     what was asked for
-    log.jsonl         one line for each logged step: losses, seconds
+    settings.json     the settings
+    log.jsonl         one line per logged step: losses, seconds
     tensorboard/      the same as curves, and the pictures
-    pictures/         each validation's: events, image, truth
+    pictures/         of each validation: events, image, truth
     checkpoints/      the whole state (orbax), the newest two
-    weights.npz       the parameters that did best on the validation sequences so far
+    weights.npz       the parameters with the least validation loss so far
     last.npz          those of the last validation
 """
 
@@ -35,7 +35,7 @@ from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage import runs
 from firenet_jax.storage.files import locked, write_text
 from firenet_jax.storage.progress import bar
-from firenet_jax.training.batches import NOTHING, batches, split
+from firenet_jax.training.batches import NO_AUGMENT, batches, split
 from firenet_jax.training.log import Log
 from firenet_jax.training.settings import Train
 from firenet_jax.training.step import (
@@ -48,15 +48,15 @@ from firenet_jax.training.step import (
 )
 
 VALIDATION = 8  # batches
-FREE = "log_every", "save_every", "validate_every"  # say nothing about what is computed
+UNRECORDED = "log_every", "save_every", "validate_every"  # do not affect what is computed
 
 
 def run(settings: Train, stop: int | None = None) -> None:
-    """Trains as the settings say, going on where an interrupted run stopped.
+    """Trains as the settings say, or resumes an interrupted run.
 
-    stop: leave after so many steps, in the middle of the schedule.
-    Raises a FirenetError where the settings do not fit the folder, the weights or the devices, or
-    where another run writes into the folder.
+    stop: end after this many steps, in the middle of the schedule.
+    Raises a FirenetError if the settings do not match the folder, the weights or the devices, or if
+    another run writes into the folder.
     """
     join(settings.coordinator, settings.processes, settings.process)
     if settings.batch % jax.device_count():
@@ -77,7 +77,7 @@ def run(settings: Train, stop: int | None = None) -> None:
             logger.warning("%s: going on after step %d", folder, state.step)
         done = int(state.step)
         sources, validation = sources_of(settings, done)
-        _keep_settings(folder, settings)  # now that all is there: a failed start blocks no folder
+        _keep_settings(folder, settings)  # only now, so that a failed start leaves no run behind
         log = Log(folder, done)
         best, last_save = log.best(), time.monotonic()
         last = min(settings.steps, stop or settings.steps)
@@ -130,10 +130,10 @@ def _judge(
 
 @contextlib.contextmanager
 def _interruptible():
-    """A list that Ctrl-C, pressed once, puts something in; pressed again, it interrupts at once.
+    """A list that is no longer empty after Ctrl-C; a second Ctrl-C interrupts at once.
 
-    So a step is never left half done. Several processes would not save at the same step: there, and
-    where this is no main thread, it interrupts at once."""
+    So a step is never left half done. With several processes, which would not save at the same
+    step, and outside of the main thread, the first Ctrl-C interrupts at once."""
     pressed: list[int] = []
     if jax.process_count() > 1 or threading.current_thread() is not threading.main_thread():
         yield pressed
@@ -151,7 +151,7 @@ def _interruptible():
 
 
 def _due(last_save: float, settings: Train) -> bool:
-    """Processes save together or not at all, so the first one's clock decides for all."""
+    """Whether to save a checkpoint. All processes save together, by the clock of the first one."""
     due = time.monotonic() - last_save > settings.save_every
     if jax.process_count() > 1:
         due = bool(multihost_utils.broadcast_one_to_all(np.array(due)))
@@ -159,7 +159,7 @@ def _due(last_save: float, settings: Train) -> bool:
 
 
 def first_state(settings: Train) -> TrainState:
-    """The state before the first step, of random parameters or of the weights that are named."""
+    """The state before the first step, with random parameters or the given weights."""
     if settings.weights is None:
         params = initial_params(jax.random.key(settings.seed))
     else:
@@ -180,15 +180,15 @@ def _keys(settings: Train) -> list[jax.Array]:
         training, validation = jax.random.split(jax.random.key(settings.seed + 1))
         return [training, *jax.random.split(validation, VALIDATION)]
 
-    return jax.jit(keys, out_shardings=sharding())()  # devices of others take keys in no other way
+    return jax.jit(keys, out_shardings=sharding())()  # device_put cannot send keys to other hosts
 
 
 def sources_of(settings: Train, done: int) -> tuple[Iterator, list[Callable[[], Simulation]]]:
-    """What `train_step` takes for the step after `done` and all later ones; validation batches.
+    """The sources of `train_step` for the step after `done` and all later ones; validation batches.
 
-    Files to validate on are no files to train on (`batches.split`). Textures to validate on are
-    cut anew, but from the same pictures: they choose between the steps of a run; how good a
-    network is on pictures it never saw they do not tell.
+    Files for validation are not used for training (`batches.split`). Textures for validation are
+    other cuts of the same pictures: they serve to compare the steps of a run, not to measure how
+    good a network is on unseen pictures.
     """
     if settings.data:
         files, others = split(settings.sequences)
@@ -197,7 +197,7 @@ def sources_of(settings: Train, done: int) -> tuple[Iterator, list[Callable[[], 
         training = batches(
             files, **shape, chain=chain, augment=augment, seed=settings.seed, first=done
         )
-        fixed = batches(others, **shape, augment=NOTHING, seed=settings.seed)
+        fixed = batches(others, **shape, augment=NO_AUGMENT, seed=settings.seed)
         validation = [_dealt(next(fixed)) for _ in range(VALIDATION)]
         fixed.close()
         return map(_dealt, training), [partial(lambda data: data, data) for data in validation]
@@ -214,7 +214,7 @@ def sources_of(settings: Train, done: int) -> tuple[Iterator, list[Callable[[], 
 
 
 def _dealt(data: Simulation) -> Simulation:
-    """A batch, of which each device keeps its part; every process has read all of it."""
+    """A batch, sharded over the devices; every process has read all of it."""
     if jax.device_count() == 1:
         return data
 
@@ -234,7 +234,7 @@ def _check_finite(terms: dict[str, float], state: TrainState, folder: Path) -> N
 
 
 def _record(settings: Train) -> dict:
-    """All that the weights depend on, and how often a run is looked at."""
+    """Everything that the weights depend on, and how often a run is logged and saved."""
     data = settings.data[0] if len(settings.data) == 1 else list(settings.data) or None
     but = "output", "coordinator", "processes", "process"
     return runs.recorded(settings, but=but, data=data)
@@ -243,8 +243,8 @@ def _record(settings: Train) -> dict:
 def _check_settings(folder: Path, settings: Train) -> None:
     """Raises OutputError if the folder holds a run of other settings.
 
-    Options that the run there does not know, as it is older than they are, count as their defaults.
-    Those of `FREE` may change.
+    Options that did not exist when the run began count as their defaults. Those of `UNRECORDED` may
+    change.
     """
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder} is a file, but a run needs a folder: choose another --output")
@@ -255,7 +255,7 @@ def _check_settings(folder: Path, settings: Train) -> None:
     found, now = runs.completed(found, _record(Train(folder))), _record(settings)
     done = (folder / "checkpoints" / str(found["steps"])).is_dir()
     longer = isinstance(found["steps"], int) and found["steps"] < settings.steps
-    if longer and done and not runs.differences(found, now, but=(*FREE, "steps")):
+    if longer and done and not runs.differences(found, now, but=(*UNRECORDED, "steps")):
         logger.warning(
             "%s: its %d steps are done: it goes on to %d, with the rate of a run so long",
             folder, found["steps"], settings.steps,
@@ -263,10 +263,10 @@ def _check_settings(folder: Path, settings: Train) -> None:
         return
     runs.check_same(
         found, now, f"{folder} holds a run with other settings",
-        "choose another --output, or go on with the same settings", but=FREE,
+        "choose another --output, or go on with the same settings", but=UNRECORDED,
     )  # fmt: skip
 
 
 def _keep_settings(folder: Path, settings: Train) -> None:
-    if is_first():  # others may be looking
+    if is_first():  # only one process writes
         write_text(folder / "settings.json", runs.as_text(_record(settings)))

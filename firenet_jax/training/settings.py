@@ -1,7 +1,7 @@
-"""A command line -> settings of a training run: what it learns from, how, and how it is looked at.
+"""A command line -> settings of a training run: data, optimisation, logging.
 
-`Train.step_settings` is the part that a compiled step sees: no paths, so that a run into another
-folder compiles nothing anew.
+`Train.step_settings` is the part that is static in the compiled step: without paths, so that a run
+into another folder does not recompile.
 """
 
 import dataclasses
@@ -21,12 +21,12 @@ from firenet_jax.training.batches import Augment, is_set
 from firenet_jax.training.losses import DISTANCES, Loss
 from firenet_jax.training.step import StepSettings
 
-SMALLEST = 11  # pixels on a side of what validation measures: SSIM's window
+MIN_CROP = 11  # pixels on a side of what validation measures: SSIM's window
 
 
 @dataclass(frozen=True)
 class Train:
-    """Train FireNet on sequences that are simulated as it goes.
+    """Train FireNet on sequences simulated on the fly, on files, or on recordings with frames.
 
     Examples:
       firenet train -o run
@@ -37,74 +37,75 @@ class Train:
     """
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Folder of the run; an interrupted run in it goes on."""
+    """Folder of the run; an interrupted run in it is resumed."""
     weights: Annotated[Path | None, tyro.conf.arg(aliases=["-c"])] = None
     """Start from these weights instead of random ones; built-in: those of the package."""
     data: tuple[Path, ...] = ()
-    """A folder of HDF5 sequences (`firenet simulate`, or downloaded), or recordings with frames,
-    whose ends are held out: instead of simulating as it goes."""
+    """Instead of simulating: a folder of HDF5 sequences (`firenet simulate`, or a data set), or
+    recordings with frames, whose ends are held out."""
     images: Path | None = None
-    """Folder of pictures for textures (default: scikit-image's photographs, and drawn ones)."""
+    """Folder of pictures for textures (default: scikit-image's photographs and procedural
+    textures)."""
     textures: int = 256
-    """How many textures to cut from them."""
+    """Number of textures."""
     procedural: float = 0.25
-    """Part of the textures that is drawn instead."""
+    """Share of the textures that is procedural."""
     steps: int = 20_000
-    """Updates of the parameters. A run that is done goes on when it is given more."""
+    """Updates of the parameters. With a larger number a finished run is extended."""
     batch: int = 2
-    """Sequences in a step."""
+    """Sequences per step."""
     crop: int = 96
     """Height and width of the sequences, in pixels."""
     windows: int = 21
-    """Windows in a step, L + 1 in the paper."""
+    """Windows per step, L + 1 in the paper."""
     chain: int = 1
-    """Steps through which the longest sequence of a batch goes on, its state carried from one to
-    the next; the others are shorter, in equal proportions (64 with 4 sequences: 3, 8, 23, 64)."""
+    """Truncated back-propagation through time: carry the state through up to this many steps.
+    Sequences of a batch differ in length, in a geometric series (64, batch 4: 3, 8, 23, 64)."""
     renderings: int = 5
-    """Renderings in a window."""
+    """Renderings per window."""
     motion: tuple[float, float] = (1.25, 2.5)
-    """Pixels by which the fastest point moves in a window, at most one for a rendering; drawn
-    log-uniformly for a sequence."""
+    """Pixels by which the fastest point moves in a window, at most one per rendering; drawn
+    log-uniformly for each sequence."""
     slow: float = 0.0
-    """Part of the sequences in which next to nothing moves: there the thresholds of pixels differ
-    more, and most have next to no noise."""
+    """Share of the sequences with hardly any motion; they have more threshold mismatch, and most of
+    them hardly any noise."""
     swift: float = 0.0
-    """Part of the sequences in which 16 to 90 pixels pass in a window, before a blank ground."""
+    """Share of the sequences with a motion of 16 to 90 pixels per window, over a plain
+    background."""
     learning_rate: float = 1e-3
-    """Greatest rate, after warming up; it then falls to a hundredth along a cosine."""
+    """Peak learning rate, after the warm-up; it then decays to a hundredth along a cosine."""
     warmup: int = 200
-    """Steps in which the rate rises from zero; fewer in a run so short that they would be more than
-    a fifth of it."""
+    """Steps of the linear warm-up (default: 200, at most a fifth of the run)."""
     optimiser: Literal["muon", "adam"] = "muon"
-    """muon learns more from a step (experiments/compare_optimisers.py); adam is the paper's. A
-    rate means the same for both: the size of an update."""
+    """muon learns more per step (experiments/compare_optimisers.py); the paper used adam. The
+    learning rate has the same scale for both: the size of an update."""
     clip: float = 1.0
-    """Gradients are scaled down to this norm."""
+    """Clip gradients to this norm."""
     seed: int = 0
-    """Of the first parameters, the textures and all sequences."""
+    """Random seed of the initial parameters, the textures and the sequences."""
     bfloat16: bool = False
-    """Convolutions in bfloat16: for accelerators; on a CPU it is slower."""
+    """Compute convolutions in bfloat16. For accelerators; slower on a CPU."""
     remat: bool = False
-    """Compute convolutions again for the gradient: less memory, a little more time."""
+    """Recompute convolutions for the gradient: less memory, slightly slower."""
     log_every: int = 20
     """Steps between two lines of the log."""
     validate_every: int = 500
     """Steps between two validations."""
     save_every: float = 120.0
-    """Seconds between two checkpoints, which are made after a line of the log."""
+    """Seconds between two checkpoints, which are saved after a line of the log."""
     coordinator: str | None = None
-    """host:port of process 0, where several processes train together; start each with this. Those
-    that srun or Open MPI 4 has started find each other."""
+    """host:port of process 0, the same for all of several processes that train together. Not needed
+    under srun and Open MPI 4."""
     processes: int | None = None
-    """How many processes."""
+    """Number of processes."""
     process: int | None = None
-    """Which one this is, from 0."""
+    """Index of this process, from 0."""
     near_events: bool = False
-    """Where no events were nearby since a sequence began, the truth is a frame's mean brightness:
-    more cannot be known there. For a camera that stands still."""
+    """For a static camera: where there were no events nearby since a sequence began, the truth is
+    the frame's mean brightness."""
     loss: Loss = Loss()
     augment: Augment = Augment()
-    """What happens to sequences from files."""
+    """Augmentation of sequences from files."""
     scene: SceneSettings = SceneSettings()
     sensor: SensorSettings = dataclasses.replace(FAULTY, threshold_range=(0.1, 0.6))
 
@@ -131,9 +132,9 @@ class Train:
             )
         if not any(getattr(self.loss, name) for name in DISTANCES):
             raise SettingsError(f"no distance has a weight: pass one of {', '.join(DISTANCES)}")
-        if self.crop < SMALLEST:
+        if self.crop < MIN_CROP:
             raise SettingsError(
-                f"crop is {self.crop} pixels, but images smaller than {SMALLEST} cannot be judged"
+                f"crop is {self.crop} pixels, but images smaller than {MIN_CROP} cannot be judged"
             )
         check_range("motion", self.motion)
         check_rare(self.slow, self.swift)
@@ -157,12 +158,12 @@ class Train:
 
     @property
     def sequences(self) -> Path:
-        """Where the HDF5 sequences are, or those made of recordings: `data` is not empty."""
+        """The folder of HDF5 sequences, given or made from recordings; `data` is not empty."""
         return self.output / "sequences" if self.on_recordings else self.data[0]
 
     @property
     def step_settings(self) -> StepSettings:
-        """What a step of the training depends on, apart from its data."""
+        """The settings that a training step depends on."""
         names = {field.name for field in dataclasses.fields(StepSettings)}
         chosen: dict[str, Any] = {name: getattr(self, name) for name in names}
         chosen["warmup"] = warming_up(self)
@@ -170,6 +171,6 @@ class Train:
 
 
 def warming_up(settings: Train) -> int:
-    """Steps: what was asked for, or at most a fifth of a run where nothing was."""
+    """Steps of the warm-up: as set; the default is at most a fifth of the run."""
     asked = settings.warmup != Train.warmup
     return settings.warmup if asked else min(settings.warmup, settings.steps // 5)

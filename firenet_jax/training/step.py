@@ -1,13 +1,12 @@
-"""(parameters and states, a step's data) -> (the same after it, losses): the pure step of training.
+"""(train state, data) -> (train state, losses): the pure training step.
 
-With `chain` more than 1 a sequence goes on through so many steps (truncated back-propagation
-through time): simulation and network go on from the states where the last step left them,
-gradients stop there. The sequences of a batch are of different lengths, up to `chain` steps, so
-that each step sees states of many ages: what a recurrence does after a thousand windows is learnt
-from states that are as old, what it does at first from such as begin.
+With `chain` more than 1 a sequence continues through up to that many steps (truncated
+back-propagation through time): simulation and network start from the states at the end of the last
+step, and gradients stop there. The sequences of a batch have different lengths, up to `chain`
+steps, so each step trains on states of many ages, from new ones to those after a thousand windows.
 
-Step n is a function of the seed, n and the state alone. The sequences of a batch are dealt out to
-all devices of all processes; what is computed does not depend on how many these are.
+Step n is a function of the seed, n and the state alone. The sequences of a batch are sharded over
+all devices of all processes; the result does not depend on their number.
 
 Read `train_step` first: simulate, scan, differentiate, update.
 """
@@ -40,15 +39,15 @@ from firenet_jax.tensors import normalise
 from firenet_jax.training.losses import Loss, sequence_loss
 
 TEXTURE = 256  # pixels on a side of a texture
-NEAR = 9  # pixels on a side of the surroundings in which an event tells of a pixel
+NEIGHBOURHOOD = 9  # pixels: the side of the square around an event in which the truth counts
 
 
 @dataclass(frozen=True)
 class StepSettings:
-    """What a step depends on besides its state and its data; `settings.Train` explains each.
+    """The settings that a step depends on; `settings.Train` explains each.
 
-    It is a static argument of compiled functions, so it holds nothing that may differ between two
-    runs of the same program: no paths, no seed.
+    They are a static argument of compiled functions, so they hold nothing that may differ between
+    two runs of the same program: no paths, no seed.
     """
 
     steps: int
@@ -73,20 +72,20 @@ class StepSettings:
 
 
 class TrainState(NamedTuple):
-    """All that a step needs from the last one."""
+    """The state between two steps."""
 
     params: Any
     optimiser: Any
     step: jax.Array | np.int32  # () int32
-    carried: tuple[SensorState, State] | None  # within a chain
+    carried: tuple[SensorState, State] | None  # of sequences that continue, with `chain` > 1
 
 
 def optimiser(settings: StepSettings) -> optax.GradientTransformation:
-    """Of clipped gradients; a step whose gradient is not finite changes nothing.
+    """The optimiser, on clipped gradients; steps with a gradient that is not finite are skipped.
 
-    Muon (Jordan et al. 2024) makes the update of a kernel, as a matrix (9 inputs, outputs),
-    orthogonal; 0.2 is the root mean square of Adam's usual updates (Liu et al., arXiv 2502.16982).
-    Biases and the 1x1 convolution are Adam's in both cases.
+    Muon (Jordan et al. 2024) orthogonalises the update of a kernel, as a matrix (9 inputs,
+    outputs); 0.2 is the usual root mean square of Adam's updates (Liu et al., arXiv 2502.16982).
+    Biases and the 1x1 convolution always use Adam.
     """
     rate = optax.warmup_cosine_decay_schedule(
         0.0,
@@ -105,7 +104,7 @@ def optimiser(settings: StepSettings) -> optax.GradientTransformation:
 
 
 def _as_matrices(params):
-    """For each parameter which axes are a matrix's, or None where it is Adam's."""
+    """The axes of each parameter as a matrix; None: it uses Adam."""
     matrix = optax.contrib.MuonDimensionNumbers(reduction_axis=(0, 1, 2), output_axis=3)
     return jax.tree.map(lambda p: matrix if p.ndim == 4 and p.shape[0] > 1 else None, params)
 
@@ -113,7 +112,7 @@ def _as_matrices(params):
 def initial_train_state(params: Any, settings: StepSettings, simulates: bool = True) -> TrainState:
     """The state before the first step.
 
-    simulates: whether data is simulated as it goes, so that a sensor's state is carried too.
+    simulates: whether data is simulated on the fly, so that the sensor's state is carried too.
     """
     carried = None
     if settings.chain > 1:
@@ -135,7 +134,7 @@ def initial_train_state(params: Any, settings: StepSettings, simulates: bool = T
 
 
 def _lengths(settings: StepSettings) -> np.ndarray:
-    """(B,) steps through which each sequence of a batch goes on."""
+    """(B,) the length of each sequence of a batch in steps."""
     shares = np.arange(1, settings.batch + 1) / settings.batch
     return np.round(settings.chain**shares).astype(np.int32)
 
@@ -147,9 +146,9 @@ def _setups(
     lengths: jax.Array,
     numbers: jax.Array,
 ):
-    """Sensors, scenes and durations of a window, leading axis B, of sequences so many steps long.
+    """Sensors, scenes and window durations, leading axis B, of sequences of these lengths in steps.
 
-    numbers: (B,) int32, how many sequences there were before in the same place of the batch.
+    numbers: (B,) int32, the number of earlier sequences in the same place of the batch.
     """
 
     def one(place, length, number):
@@ -173,7 +172,7 @@ def _setups(
 
 
 def _fresh(sensors, scenes, start, settings: StepSettings) -> tuple[SensorState, State]:
-    """What sequences start from at (B,) int32 microseconds."""
+    """The states of sequences that start at (B,) int32 microseconds."""
     size = settings.crop, settings.crop
     seen = first_states(sensors, scenes, start, height=size[0], width=size[1])
     return seen, initial_state(len(start), *size)
@@ -184,7 +183,7 @@ def _simulated(
 ) -> tuple[Simulation, tuple[SensorState, State], jax.Array | bool]:
     """A step's data, the states (sensor's after it, network's before it), whether these are warm.
 
-    Without a TrainState: sequences of their own.
+    Without a TrainState: new sequences.
     """
     chained = state is not None and settings.chain > 1
     lengths = jnp.asarray(_lengths(settings) if chained else np.ones(settings.batch, np.int32))
@@ -220,11 +219,11 @@ def images_of(
     state: before the first window; None is the zero state.
     """
     run = partial(step, dtype=jnp.bfloat16 if settings.bfloat16 else jnp.float32)
-    # On a CPU what a loop keeps for the gradient goes through memory three times more (zeros, in,
-    # out), a sixth of the time; as there are few windows, they can stand in the program one by one.
+    # On a CPU the residuals of a loop go through memory three more times (zeros, write, read), a
+    # sixth of the time. There are few windows, so the loop is unrolled.
     one_by_one = jax.default_backend() == "cpu" and not (settings.bfloat16 or settings.remat)
     if not one_by_one:
-        # Of the rest of what it needs, to keep it is slower than to compute it again.
+        # All other residuals are faster to recompute than to store.
         kept = () if settings.remat else (CONVOLVED,)
         policy = jax.checkpoint_policies.save_only_these_names(*kept)
         run = jax.checkpoint(run, policy=policy, prevent_cse=False)
@@ -237,9 +236,9 @@ def images_of(
 
 
 def near_events(tensors: jax.Array) -> jax.Array:
-    """(T, B, H, W, bins) -> (T, B, H, W) bool: where events were, in this window or one before."""
+    """(T, B, H, W, bins) -> (T, B, H, W) bool: near an event of this or an earlier window."""
     there = jnp.abs(tensors).max(-1)
-    around = (1, 1, NEAR, NEAR)
+    around = (1, 1, NEIGHBOURHOOD, NEIGHBOURHOOD)
     there = jax.lax.reduce_window(there, 0.0, jax.lax.max, around, (1, 1, 1, 1), "SAME")
     return jax.lax.cummax(there) > 0
 
@@ -250,14 +249,14 @@ def loss_of(params, data: Simulation, state: State | None, warm, settings: StepS
     def one_device(params, data, state, warm):
         last, images = images_of(params, data.tensors, settings, state)
         truths = data.images
-        if settings.near_events:  # a loss that is blind elsewhere lets the image run away there
+        if settings.near_events:  # the mean elsewhere: without a loss the image would drift there
             level = truths.mean((-2, -1), keepdims=True)
             truths = jnp.where(near_events(data.tensors), truths, level)
         truth = truths, data.displacement, data.visible
         losses = sequence_loss(images, *truth, settings.loss, warm)
         return jax.lax.pmean(losses, "devices"), (last, images)
 
-    # A `warm` that is known, known it must stay: it is no argument of the program then.
+    # A constant `warm` must stay constant, so it is not an argument of the mapped function.
     known = isinstance(warm, bool)
     function = partial(one_device, warm=warm) if known else one_device
     specs = (REPLICATED, TIME_BATCH, BATCH) + (() if known else (BATCH,))
@@ -305,7 +304,7 @@ def train_step(
 
 @partial(jax.jit, static_argnames="settings")
 def simulated(key: jax.Array, textures: jax.Array, settings: StepSettings) -> Simulation:
-    """Sequences of their own, as long as a step's."""
+    """New sequences, as long as a step's."""
     return _simulated(key, textures, settings)[0]
 
 
@@ -313,8 +312,8 @@ def simulated(key: jax.Array, textures: jax.Array, settings: StepSettings) -> Si
 def validate(params, data: Simulation, settings: StepSettings):
     """(losses and metrics of a batch, pictures of its first sequence), from a zero state.
 
-    Metrics are of the images from l0 on, clipped. Pictures: (T, H, W) the images, (T, H, W) the
-    truth, (T, H, W, 5) the event tensors.
+    Metrics use the images from l0 on, clipped. Pictures: images (T, H, W), truths (T, H, W) and
+    event tensors (T, H, W, 5).
     """
     before = initial_state(*data.images.shape[1:])
     loss, (terms, _, images) = loss_of(params, data, before, False, settings)
