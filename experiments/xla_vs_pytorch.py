@@ -17,8 +17,9 @@ float32 is float32 on a GPU too: TF32 is off on both sides.
 
     python experiments/xla_vs_pytorch.py            an hour on two cores; needs torch
     python experiments/xla_vs_pytorch.py --parts training               measures one part again
-    python experiments/xla_vs_pytorch.py --only 240x180x1,640x480x1     these cases again, of all parts
+    python experiments/xla_vs_pytorch.py --only 240x180x1,640x480x1      some cases again
     python experiments/xla_vs_pytorch.py --avx2       both sides as on processors without AVX-512
+    taskset -c 0 python experiments/xla_vs_pytorch.py --one-thread      on a busy machine, see below
     python experiments/xla_vs_pytorch.py --memory     adds peak MB to what was measured, batch 1
     python experiments/xla_vs_pytorch.py --quick                        5 minutes; saves nothing
 
@@ -29,7 +30,9 @@ matrices' product ("its products alone"). Machine code has fewer products (Winog
 a fresh process grows while the method runs warm (on a GPU: what its framework holds at most).
 Cases that are not measured again stay in the results, if they are of the same machine. With --avx2
 XLA's own convolutions ("XLA in scan", bfloat16) are left out: no switch restricts all of them.
-Writes results/xla_vs_pytorch.json and .png (xla_vs_pytorch_gpu on a GPU, xla_vs_pytorch_avx2).
+With --one-thread both sides have one thread, and what is measured is the time that it has had a
+processor: whoever else uses the machine, ratios hold to some percent.
+Writes results/xla_vs_pytorch.json and .png (and _gpu, _avx2, _one_thread after the name).
 """
 
 import argparse
@@ -106,6 +109,7 @@ AVX2 = {
     "ONEDNN_MAX_CPU_ISA": "AVX2",
     "MKL_ENABLE_INSTRUCTIONS": "AVX2",
 }
+ONE_THREAD = "--one-thread" in sys.argv
 IS_AVX2 = AVX2.items() <= os.environ.items()
 
 # A method is made when it is asked for: a function without arguments that returns its result when
@@ -231,11 +235,12 @@ def step_makers(width: int, height: int, batch: int) -> Makers:
         "JAX step, bfloat16": partial(jax_step, jnp.bfloat16),
         "JAX in scan, bfloat16": partial(jax_scan, jnp.bfloat16),
     }
-    if IS_AVX2:
-        makers = {"JAX in scan": makers["JAX in scan"]}
+    if IS_AVX2 or ONE_THREAD:
+        names = ["JAX in scan"] if IS_AVX2 else ["JAX in scan", "XLA in scan"]
+        makers = {name: makers[name] for name in names}
     for name, (make, memory_format) in models(params, (batch, height, width)).items():
         makers[name] = partial(torch_step, make, memory_format)
-    if IS_AVX2:
+    if IS_AVX2 or ONE_THREAD:
         return makers
     return makers | {"PyTorch channels_last, bfloat16": torch_bfloat16}
 
@@ -340,7 +345,7 @@ def training_makers(crop: int, batch: int) -> Makers:
     }
     if COMPILER:
         makers["PyTorch compile"] = partial(theirs, NHWC, compiled=True)
-    if IS_AVX2:
+    if IS_AVX2 or ONE_THREAD:
         return {name: make for name, make in makers.items() if "bfloat16" not in name}
     bfloat16 = partial(theirs, NHWC, dtype=torch.bfloat16)
     return makers | {"PyTorch channels_last, bfloat16": bfloat16}
@@ -422,7 +427,8 @@ def compare(part: str, case: tuple, units: dict[str, int], options) -> dict:
         differences[name] = difference(result, expected)
         bound = 1 if part == "pipeline" else 1e-4
         assert "bfloat16" in name or differences[name] <= bound, (name, differences[name])
-    seconds = interleaved(methods, options.runs, REST)
+    clock = time.process_time if ONE_THREAD else time.perf_counter
+    seconds = interleaved(methods, options.runs, REST, clock)
     seconds = {name: [s / units.get(name, 1) for s in runs] for name, runs in seconds.items()}
     rows = table(seconds, base)
     print(f"{'':34} {'first s':>10} {'differs by':>12}")
@@ -499,10 +505,13 @@ def measure_step(options) -> dict:
         cases += [(width, height, batch) for batch in BATCHES if batch <= 16 // less]
     cases = chosen(cases, options)
     units = dict.fromkeys(["JAX in scan", "XLA in scan", "JAX in scan, bfloat16"], IN_SCAN)
-    rate = products_per_second(options.runs)
+    rate = None if ONE_THREAD else products_per_second(options.runs)
     results = []
     for width, height, batch in cases:
         result = compare("step", (width, height, batch), units, options)
+        if rate is None:
+            results.append(result)
+            continue
         limit = 1e3 * batch * multiply_adds(height, width) / rate
         print(f"{'its products alone, as in a matrix':34} {limit:10.2f}")
         results.append(result | {"limit_ms": limit})
@@ -555,7 +564,7 @@ def measure_training(options) -> dict:
         case |= {"fastest_pytorch": fastest, "jax_over_it": rows["JAX"] / theirs[fastest]}
         print(f"JAX takes {case['jax_over_it']:.2f} times as long as {fastest}")
         cases.append(case)
-    if options.only or IS_AVX2:
+    if options.only or IS_AVX2 or ONE_THREAD:
         return {"cases": cases}
     return {
         "cases": cases,
@@ -668,11 +677,14 @@ def main():
     parser.add_argument("--quick", action="store_true", help="smallest sizes, save nothing")
     parser.add_argument("--only", default="", help="cases, such as 240x180x1 (step), 96x2")
     parser.add_argument("--avx2", action="store_true", help="both sides without AVX-512")
+    parser.add_argument("--one-thread", action="store_true", help="processor time of one thread")
     parser.add_argument("--memory", action="store_true", help="add peak MB instead of timing")
     parser.add_argument("--peak", help=argparse.SUPPRESS)  # a process that `peak` starts
     options = parser.parse_args()
     if options.avx2 and not IS_AVX2:
         os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | AVX2)
+    if ONE_THREAD and (threads := torch.get_num_threads()) > 1:
+        parser.error(f"{threads} threads: start it as taskset -c 0 python ...")
     if DEVICE == "cuda":
         jax.config.update("jax_default_matmul_precision", "highest")
         torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
@@ -692,7 +704,7 @@ def main():
         "compiler": COMPILER,
         "runs": options.runs,
     }
-    name = on_this_device("xla_vs_pytorch") + "_avx2" * IS_AVX2
+    name = on_this_device("xla_vs_pytorch") + "_avx2" * IS_AVX2 + "_one_thread" * ONE_THREAD
     path = RESULTS / f"{name}.json"
     results = json.loads(path.read_text()) if path.exists() else {}
     for part in options.parts.split(","):
@@ -703,7 +715,8 @@ def main():
             results[part] = merged(results.get(part, {}), measured)
         if not options.quick:
             save(name, {part: results[part] for part in MEASURE if part in results})
-            plot(results, path.with_suffix(".png"))
+            if not ONE_THREAD:
+                plot(results, path.with_suffix(".png"))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from test_network import random_run
 
+pytest.importorskip("llvmlite")
+
 from firenet_jax import native, network
 from firenet_jax.native import llvm, whole_step, winograd
 from firenet_jax.network import State, Weights, initial_state
@@ -150,5 +152,5 @@ def test_runs_where_xla_has_one_thread():
         "from firenet_jax.native import choice\n"
         "assert choice._made and not choice._failure\n"
     )
-    flags = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}
+    flags = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "FIRENET_NATIVE": "1"}
     subprocess.run([sys.executable, "-c", script], env=os.environ | flags, check=True)
