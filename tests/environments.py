@@ -32,8 +32,7 @@ CORE = """
     events windows tensors network convolution blocks reconstruction pictures checkpoint
     choice machine_code foreign_call native convolve3x3 trial
 """.split()
-# Its parts that only runs need that train or read cameras are not the core's.
-EXTRAS = ["pytest>=8.3", "optax>=0.2.8", "scikit-image>=0.25"]
+TOOLS = ["pytest>=8.3"]
 
 
 def tried(name: str, folder: Path) -> bool:
@@ -47,7 +46,7 @@ def tried(name: str, folder: Path) -> bool:
     # A copy: what pip builds in a checkout stays there, and the installed package is what is tried.
     copy = folder / "source"
     shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", ".venv", "results"))
-    run_pip("install", copy, *EXTRAS)
+    run_pip("install", copy, *TOOLS)
     if pip:
         run_pip(*pip)
     shutil.rmtree(copy / "firenet_jax")
