@@ -65,8 +65,10 @@ def tried(name: str, folder: Path) -> bool:
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="*", choices=[*ENVIRONMENTS, []], help="all, without any")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(ENVIRONMENTS))
     names = parser.parse_args().names or list(ENVIRONMENTS)
+    if unknown := set(names) - set(ENVIRONMENTS):
+        parser.error(f"no such environment: {', '.join(sorted(unknown))}")
     passed = []
     for name in names:
         print(f"\n{name}", flush=True)
