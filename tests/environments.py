@@ -1,6 +1,6 @@
 """The core's tests, in one virtual environment for each of these versions of what it stands on.
 
-    python tests/environments.py                       all: 20 minutes and more on two cores
+    python tests/environments.py                       all
     python tests/environments.py "without llvmlite"    one
     python3.14 tests/environments.py "newest jax"      with the newest that another Python can have
 
