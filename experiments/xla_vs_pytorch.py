@@ -17,6 +17,9 @@ float32 is float32 on a GPU too: TF32 is off on both sides.
 
     python experiments/xla_vs_pytorch.py            an hour on two cores; needs torch
     python experiments/xla_vs_pytorch.py --parts training               measures one part again
+    python experiments/xla_vs_pytorch.py --only 240x180x1,640x480x1      some cases again
+    python experiments/xla_vs_pytorch.py --avx2       both sides as on processors without AVX-512
+    taskset -c 0 python experiments/xla_vs_pytorch.py --one-thread      on a busy machine, see below
     python experiments/xla_vs_pytorch.py --memory     adds peak MB to what was measured, batch 1
     python experiments/xla_vs_pytorch.py --quick                        5 minutes; saves nothing
 
@@ -25,7 +28,11 @@ matrices' product ("its products alone"). Machine code has fewer products (Winog
 
 "first s" is the first call: compilation, if there is any, and one run. "peak MB" is by how much
 a fresh process grows while the method runs warm (on a GPU: what its framework holds at most).
-Writes results/xla_vs_pytorch.json and .png (xla_vs_pytorch_gpu on a GPU).
+Cases that are not measured again stay in the results, if they are of the same machine. With --avx2
+XLA's own convolutions ("XLA in scan", bfloat16) are left out: no switch restricts all of them.
+With --one-thread both sides have one thread, and what is measured is the time that it has had a
+processor: whoever else uses the machine, ratios hold to some percent.
+Writes results/xla_vs_pytorch.json and .png (and _gpu, _avx2, _one_thread after the name).
 """
 
 import argparse
@@ -94,6 +101,16 @@ DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 COMPILER = shutil.which(os.environ.get("CXX", "g++"))
 
 NCHW, NHWC = torch.contiguous_format, torch.channels_last
+# Read when JAX and PyTorch are imported: what keeps each from instructions of AVX-512.
+AVX2 = {
+    "FIRENET_NATIVE": "avx2",
+    "XLA_FLAGS": "--xla_cpu_max_isa=AVX2",
+    "ATEN_CPU_CAPABILITY": "avx2",
+    "ONEDNN_MAX_CPU_ISA": "AVX2",
+    "MKL_ENABLE_INSTRUCTIONS": "AVX2",
+}
+ONE_THREAD = "--one-thread" in sys.argv
+IS_AVX2 = AVX2.items() <= os.environ.items()
 
 # A method is made when it is asked for: a function without arguments that returns its result when
 # the work is done.
@@ -218,8 +235,13 @@ def step_makers(width: int, height: int, batch: int) -> Makers:
         "JAX step, bfloat16": partial(jax_step, jnp.bfloat16),
         "JAX in scan, bfloat16": partial(jax_scan, jnp.bfloat16),
     }
+    if IS_AVX2 or ONE_THREAD:
+        names = ["JAX in scan"] if IS_AVX2 else ["JAX in scan", "XLA in scan"]
+        makers = {name: makers[name] for name in names}
     for name, (make, memory_format) in models(params, (batch, height, width)).items():
         makers[name] = partial(torch_step, make, memory_format)
+    if IS_AVX2 or ONE_THREAD:
+        return makers
     return makers | {"PyTorch channels_last, bfloat16": torch_bfloat16}
 
 
@@ -323,6 +345,8 @@ def training_makers(crop: int, batch: int) -> Makers:
     }
     if COMPILER:
         makers["PyTorch compile"] = partial(theirs, NHWC, compiled=True)
+    if IS_AVX2 or ONE_THREAD:
+        return {name: make for name, make in makers.items() if "bfloat16" not in name}
     bfloat16 = partial(theirs, NHWC, dtype=torch.bfloat16)
     return makers | {"PyTorch channels_last, bfloat16": bfloat16}
 
@@ -403,7 +427,8 @@ def compare(part: str, case: tuple, units: dict[str, int], options) -> dict:
         differences[name] = difference(result, expected)
         bound = 1 if part == "pipeline" else 1e-4
         assert "bfloat16" in name or differences[name] <= bound, (name, differences[name])
-    seconds = interleaved(methods, options.runs, REST)
+    clock = time.process_time if ONE_THREAD else time.perf_counter
+    seconds = interleaved(methods, options.runs, REST, clock)
     seconds = {name: [s / units.get(name, 1) for s in runs] for name, runs in seconds.items()}
     rows = table(seconds, base)
     print(f"{'':34} {'first s':>10} {'differs by':>12}")
@@ -465,17 +490,28 @@ def print_peak(part: str, name: str, *case) -> None:
     print((resident("VmHWM") - before) / 1024)
 
 
+def chosen(cases: list[tuple], options) -> list[tuple]:
+    """Those that are asked for."""
+    if options.quick:
+        return cases[:1]
+    only = options.only.split(",") if options.only else []
+    return [case for case in cases if not only or "x".join(map(str, case)) in only]
+
+
 def measure_step(options) -> dict:
     cases = []
     for resolution, less in RESOLUTIONS.items():
         width, height = map(int, resolution.split("x"))
         cases += [(width, height, batch) for batch in BATCHES if batch <= 16 // less]
-    cases = [cases[0]] if options.quick else cases
+    cases = chosen(cases, options)
     units = dict.fromkeys(["JAX in scan", "XLA in scan", "JAX in scan, bfloat16"], IN_SCAN)
-    rate = products_per_second(options.runs)
+    rate = None if ONE_THREAD else products_per_second(options.runs)
     results = []
     for width, height, batch in cases:
         result = compare("step", (width, height, batch), units, options)
+        if rate is None:
+            results.append(result)
+            continue
         limit = 1e3 * batch * multiply_adds(height, width) / rate
         print(f"{'its products alone, as in a matrix':34} {limit:10.2f}")
         results.append(result | {"limit_ms": limit})
@@ -506,9 +542,8 @@ def products_per_second(runs: int) -> float:
 
 def measure_pipeline(options) -> dict:
     cases = [tuple(map(int, resolution.split("x"))) for resolution in RESOLUTIONS]
-    cases = cases[:1] if options.quick else cases
     results = []
-    for case in cases:
+    for case in chosen(cases, options):
         units = dict.fromkeys(pipeline_makers(16, 16), IN_CHUNK)
         results.append(compare("pipeline", case, units, options))
     return {"cases": results}
@@ -517,7 +552,7 @@ def measure_pipeline(options) -> dict:
 def measure_training(options) -> dict:
     sizes = [(crop, batch) for crop in (96, 128) for batch in (2, 4)]
     cases = []
-    for crop, batch in sizes[:1] if options.quick else sizes:
+    for crop, batch in chosen(sizes, options):
         case = compare("training", (crop, batch), {}, options)
         rows = {row["method"]: row["median_ms"] for row in case["rows"]}
         theirs = {
@@ -529,6 +564,8 @@ def measure_training(options) -> dict:
         case |= {"fastest_pytorch": fastest, "jax_over_it": rows["JAX"] / theirs[fastest]}
         print(f"JAX takes {case['jax_over_it']:.2f} times as long as {fastest}")
         cases.append(case)
+    if options.only or IS_AVX2 or ONE_THREAD:
+        return {"cases": cases}
     return {
         "cases": cases,
         "losses": losses_share(options.runs),
@@ -561,6 +598,14 @@ def losses_share(runs: int) -> dict:
     rows = table(interleaved(methods, runs), "step on data that are there")
     print(f"losses: {rows[1]['ratio']:.1%} of a step")
     return {"share": rows[1]["ratio"], "rows": rows}
+
+
+def merged(before: dict, after: dict) -> dict:
+    """A part's results, with what was measured before on the same machine and not again."""
+    if before.get("machine") != after["machine"]:
+        return after
+    cases = {tuple(each["case"]): each for each in before["cases"] + after["cases"]}
+    return before | after | {"cases": [cases[case] for case in sorted(cases)]}
 
 
 MEASURE = {"step": measure_step, "pipeline": measure_pipeline, "training": measure_training}
@@ -630,9 +675,16 @@ def main():
     parser.add_argument("--parts", default=",".join(MEASURE), help="those to measure")
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--quick", action="store_true", help="smallest sizes, save nothing")
+    parser.add_argument("--only", default="", help="cases, such as 240x180x1 (step), 96x2")
+    parser.add_argument("--avx2", action="store_true", help="both sides without AVX-512")
+    parser.add_argument("--one-thread", action="store_true", help="processor time of one thread")
     parser.add_argument("--memory", action="store_true", help="add peak MB instead of timing")
     parser.add_argument("--peak", help=argparse.SUPPRESS)  # a process that `peak` starts
     options = parser.parse_args()
+    if options.avx2 and not IS_AVX2:
+        os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | AVX2)
+    if ONE_THREAD and (threads := torch.get_num_threads()) > 1:
+        parser.error(f"{threads} threads: start it as taskset -c 0 python ...")
     if DEVICE == "cuda":
         jax.config.update("jax_default_matmul_precision", "highest")
         torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
@@ -648,20 +700,23 @@ def main():
         "machine": machine(),
         "torch": torch.__version__,
         "torch threads": torch.get_num_threads(),
+        "torch instructions": torch.backends.cpu.get_cpu_capability(),
         "compiler": COMPILER,
         "runs": options.runs,
     }
-    name = on_this_device("xla_vs_pytorch")
+    name = on_this_device("xla_vs_pytorch") + "_avx2" * IS_AVX2 + "_one_thread" * ONE_THREAD
     path = RESULTS / f"{name}.json"
     results = json.loads(path.read_text()) if path.exists() else {}
     for part in options.parts.split(","):
         if options.memory:
             add_memory(part, results[part]["cases"])
         else:  # parts may be of different runs: each says for itself how it was measured
-            results[part] = how | MEASURE[part](options)
+            measured = how | MEASURE[part](options)
+            results[part] = merged(results.get(part, {}), measured)
         if not options.quick:
             save(name, {part: results[part] for part in MEASURE if part in results})
-            plot(results, path.with_suffix(".png"))
+            if not ONE_THREAD:
+                plot(results, path.with_suffix(".png"))
 
 
 if __name__ == "__main__":

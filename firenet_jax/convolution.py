@@ -72,8 +72,11 @@ def layer(
     (B, H, W, I / maps), (rows, columns, I, O), (O,) -> (B, H, W, O / activations); activations are
     keys of `ACTIVATIONS`. Gradients in reverse mode only; the results are their residuals, named
     `CONVOLVED` (for jax.checkpoint).
+    Raises ValueError for a bias of another shape: XLA would broadcast it, machine code read beyond.
     """
     bias = jnp.zeros(kernel.shape[3], kernel.dtype) if bias is None else bias
+    if bias.shape != kernel.shape[3:]:
+        raise ValueError(f"the bias is {bias.shape}, but the kernel's is {kernel.shape[3:]}")
     return _layer(native.is_wanted(), activations, tuple(maps), kernel, bias)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from test_trial import random_case
 
 from firenet_jax import native
-from firenet_jax.native import convolve3x3, kernel_gradient, llvm, whole_step
+from firenet_jax.native import convolve3x3, endings, kernel_gradient, llvm, whole_step
 
 PAGE = mmap.PAGESIZE
 _protect = ctypes.CDLL(None, use_errno=True).mprotect
@@ -105,6 +105,35 @@ def check_layer(height, width, inputs, outputs, at_end):
     )
 
 
+# Sums that an ending takes; each has a kernel of its own, of one map or two.
+SUMS = {"gates": 2, "add both": 2, "candidate gradient": 2}
+
+
+def check_ending(height, width, ending, at_end):
+    rng, batch = np.random.default_rng(0), 2
+    sums, maps = SUMS.get(ending, 1), 1 + (ending in ("gates", "candidate"))
+
+    def normal(*shape):
+        return jnp.asarray(0.3 * rng.normal(size=shape), jnp.float32)
+
+    layer = convolve3x3.Layer(height, width, (16,) * maps, ("none",) * sums, 16, True, ending)
+    images = [normal(batch, height, width, 16) for _ in range(maps)]
+    others = [normal(batch, height, width, 16) for _ in range(layer.operands)]
+    kernel, bias = normal(3, 3, 16 * maps, 16 * sums), normal(16 * sums)
+    results = [np.full(images[0].shape, np.nan)] * layer.results
+    before = [*images, convolve3x3._kernel(layer, kernel), bias, *others]
+    memory = run(
+        lambda module: convolve3x3._stages(module, layer),
+        [*before, *results],
+        batch,
+        -(-height // convolve3x3.ROWS),
+        at_end,
+    )
+    expected = native.convolve(images, kernel, bias, layer.activations, ending, others)
+    for found, wanted in zip(memory, [*before, *expected], strict=True):
+        np.testing.assert_array_equal(found, np.ravel(wanted))
+
+
 if __name__ == "__main__":
     for at_end in (True, False):
         for size in [(1, 1), (5, 9), (13, 25), (4, 70)]:
@@ -117,3 +146,5 @@ if __name__ == "__main__":
             (9, 33, 16, 16),
         ]:
             check_layer(*case, at_end=at_end)
+        for ending in endings.ENDINGS:
+            check_ending(5, 11, ending, at_end=at_end)

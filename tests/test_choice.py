@@ -26,8 +26,9 @@ def case():
 
 
 @pytest.fixture
-def afresh():
-    """No program of before is used in this test, and none of it after."""
+def afresh(monkeypatch):
+    """No program of before is used in this test, and none of it after; nothing is switched off."""
+    monkeypatch.delenv("FIRENET_NATIVE", raising=False)
     jax.clear_caches()
     yield
     jax.clear_caches()

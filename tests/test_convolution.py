@@ -3,7 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from firenet_jax.convolution import convolve, kernel_gradient, side_by_side
+from firenet_jax import native
+from firenet_jax.convolution import convolve, kernel_gradient, layer, side_by_side
 
 
 def slow_convolution(image, kernel):
@@ -61,3 +62,12 @@ def test_gradients_are_those_of_the_loops(shape):
         assert (np.asarray(gradient) * direction).sum() == pytest.approx(expected, rel=1e-4)
     quick = kernel_gradient(jnp.asarray(image), jnp.asarray(kernel), jnp.float32(cotangent))
     np.testing.assert_allclose(quick, by_kernel, atol=1e-3)
+
+
+@pytest.mark.parametrize("alone", [False, True])
+@pytest.mark.parametrize("length", [1, 15, 17])
+def test_a_bias_of_another_length_is_refused(length, alone):
+    """XLA would stretch one of one number; machine code would read beyond it."""
+    image, kernel = random_case((3, 3, 16, 16))
+    with native.by_xla_alone(alone), pytest.raises(ValueError, match=rf"bias is \({length},\)"):
+        layer([image], kernel, jnp.zeros(length))

@@ -78,11 +78,9 @@ def test_equals_float64_and_xla(shape):
     )
 
 
-def test_on_processors_with_vectors_of_256_bits(monkeypatch):
+def test_on_processors_without_avx512(monkeypatch):
     """The instructions of one run on all that have more."""
-    features = llvm.binding.FeatureMap({"avx2": True, "fma": True})
-    monkeypatch.setattr(llvm.binding, "get_host_cpu_name", lambda: "haswell")
-    monkeypatch.setattr(llvm.binding, "get_host_cpu_features", lambda: features)
+    monkeypatch.setenv("FIRENET_NATIVE", "avx2")
     for shape in [(2, 10, 33, 5, 16), (1, 9, 21, 32, 32), (2, 9, 29, 16, 16)]:
         image, kernel, gradient = random_case(*shape)
         result, by_kernel = exact(image, kernel, gradient)
@@ -266,3 +264,42 @@ def test_several_maps_as_one_with_bias_and_activation(maps, activations):
         jax.tree.map(
             lambda a, b: assert_same(np.asarray(a), np.asarray(b)), function(*arguments), expected
         )
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"bias": (1,)},
+        {"bias": (16,)},
+        {"kernel": (3, 3, 16, 32)},
+        {"kernel": (3, 3, 48, 32)},
+        {"maps": [(2, 5, 6, 16), (2, 5, 7, 16)]},
+        {"maps": [(2, 5, 6, 16), (1, 5, 6, 16)]},
+        {"operand": (2, 5, 5, 16)},
+        {"operand": (2, 5, 6, 15)},
+        {"operand": None},
+    ],
+    ids=str,
+)
+def test_what_does_not_fit_together_is_not_read(change):
+    """Whatever XLA does with it: machine code would read beyond the end."""
+    shapes = {
+        "maps": [(2, 5, 6, 16), (2, 5, 6, 16)],
+        "kernel": (3, 3, 32, 32),
+        "bias": (32,),
+        "operand": (2, 5, 6, 16),
+    } | change
+    maps = [jnp.zeros(shape) for shape in shapes["maps"]]
+    operands = [jnp.zeros(shapes["operand"])] if shapes["operand"] else []
+    kernel, bias = jnp.zeros(shapes["kernel"]), jnp.zeros(shapes["bias"])
+    with pytest.raises(Unavailable):
+        native.convolve(maps, kernel, bias, ("none", "none"), "gates", operands)
+
+
+def test_gradients_that_do_not_fit_together_are_not_read():
+    image, gradient = jnp.zeros((2, 5, 6, 16)), jnp.zeros((2, 5, 6, 16))
+    for other in ((2, 5, 6, 32), (2, 4, 6, 16), (1, 5, 6, 16)):
+        with pytest.raises(Unavailable):
+            native.gradients([image], jnp.zeros((3, 3, 16, 16)), [jnp.zeros(other)])
+        with pytest.raises(Unavailable):
+            native.gradients([jnp.zeros(other)], jnp.zeros((3, 3, 16, 16)), [gradient])

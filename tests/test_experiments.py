@@ -28,6 +28,7 @@ SMALL = {
     "compare_losses": "{folder}/runs --steps 1 --only l1",
     "compare_optimisers": "{folder}/runs --steps 1 --only 'muon, rate 3e-3'",
     "endurance": f"{WEIGHTS} --recordings {{folder}} --only palindrome contrast",
+    "exactness": "--cases 1",
     "figure3_qualitative": "--seconds 0.2",
     "figure4_high_speed": "--seconds 0.1 --windows 4",
     "figure5_recurrence": "--seconds 0.2",

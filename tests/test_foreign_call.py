@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+pytest.importorskip("llvmlite")
+
 from firenet_jax.native import foreign_call
 from firenet_jax.native.foreign_call import register
 from firenet_jax.native.llvm import INT, POINTER, Function, Module, integer, vectors

@@ -3,6 +3,8 @@ import ctypes
 import numpy as np
 import pytest
 
+pytest.importorskip("llvmlite")
+
 from firenet_jax.native.llvm import (
     FLOAT,
     INT,

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from test_network import random_run
 
+pytest.importorskip("llvmlite")
+
 from firenet_jax import native, network
-from firenet_jax.native import llvm, winograd
+from firenet_jax.native import llvm, whole_step, winograd
 from firenet_jax.network import State, Weights, initial_state
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.tensors import normalise
@@ -56,7 +58,7 @@ def test_equals_the_step_of_the_network(height, width):
     params, tensors = random_run(steps=4, batch=3, height=height, width=width)
     exists = jnp.array([[True, True, True], [True, False, True], [False] * 3, [True] * 3])
     expected, found = both(params, random_state(3, height, width), tensors, exists)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), found, expected)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), found, expected)
 
 
 @pytest.mark.parametrize("height, width", [(1, 1), (2, 3), (13, 25), (20, 53)])
@@ -85,15 +87,26 @@ def test_winograd_is_a_correlation(halves):
     np.testing.assert_allclose(found, np.correlate(pixels, kernel), atol=1e-5)
 
 
-def test_processors_with_vectors_of_256_bits(monkeypatch):
+def test_processors_without_avx512(monkeypatch):
     """The instructions of one run on all that have more."""
-    features = llvm.binding.FeatureMap({"avx2": True, "fma": True})
-    monkeypatch.setattr(llvm.binding, "get_host_cpu_name", lambda: "haswell")
-    monkeypatch.setattr(llvm.binding, "get_host_cpu_features", lambda: features)
+    monkeypatch.setenv("FIRENET_NATIVE", "avx2")
+    assert llvm.vectors() == 8
     params, tensors = random_run(steps=2, batch=2, height=15, width=43)
     exists = jnp.ones((2, 2), bool)
     expected, found = both(params, random_state(2, 15, 43), tensors, exists)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), found, expected)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), found, expected)
+
+
+@pytest.mark.parametrize("switch", ["1", "avx2"])
+def test_which_instructions_there_are(monkeypatch, switch):
+    monkeypatch.setenv("FIRENET_NATIVE", switch)
+    module, machine = llvm.Module(), llvm.machine()
+    for stage in whole_step._stages(module, whole_step.Size(20, 40), True):
+        stage.linkage = ""
+    text = machine.emit_assembly(llvm.optimised(module, machine))
+    assert "vfmadd" in text
+    assert "%ymm" in text or llvm.vectors() == 32
+    assert ("%zmm" in text) == (llvm.vectors() == 32)
 
 
 def test_leaves_its_arguments_alone():
@@ -139,5 +152,5 @@ def test_runs_where_xla_has_one_thread():
         "from firenet_jax.native import choice\n"
         "assert choice._made and not choice._failure\n"
     )
-    flags = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}
+    flags = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "FIRENET_NATIVE": "1"}
     subprocess.run([sys.executable, "-c", script], env=os.environ | flags, check=True)

@@ -17,7 +17,8 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
-SWITCH = "FIRENET_NATIVE"  # 0 in the environment: never
+# In the environment: 0 for never, avx2 for as it is on processors without AVX-512.
+SWITCH = "FIRENET_NATIVE"
 
 
 class Unavailable(Exception):

@@ -314,12 +314,19 @@ def convolve(
     channels: then the results are its own.
     Raises Unavailable for what it does not compute, where XLA must.
     """
-    check(kernel, *maps, *operands, *(() if bias is None else (bias,)))
+    check(kernel, maps, operands)
+    if bias is not None and (bias.shape != kernel.shape[3:] or bias.dtype != jnp.float32):
+        raise Unavailable
     batch, height, width, _ = maps[0].shape
     outputs, odd = divmod(kernel.shape[3], len(activations))
     inputs = tuple(x.shape[3] for x in maps)
     layer = Layer(height, width, inputs, activations, outputs, bias is not None, ending)
-    if odd or outputs % LANES or (ending and not _is_winograd(layer)):
+    is_odd_ending = ending and (
+        not _is_winograd(layer)
+        or len(operands) != layer.operands
+        or any(x.shape[3] != LANES for x in operands)
+    )
+    if odd or outputs % LANES or is_odd_ending:
         raise Unavailable
     kernel = _kernel(layer, kernel)
     shape = jax.ShapeDtypeStruct((batch, height, width, outputs), jnp.float32)
@@ -329,8 +336,12 @@ def convolve(
     return list(call(*maps, kernel, *(() if bias is None else (bias,)), *operands))
 
 
-def check(kernel: jax.Array, *arrays: jax.Array) -> None:
-    """Raises Unavailable for what is not computed here."""
+def check(kernel: jax.Array, maps: Sequence[jax.Array], others: Sequence[jax.Array]) -> None:
+    """Raises Unavailable for what is not computed here: XLA computes it, or refuses what does not
+    fit together, of which machine code would read beyond the end."""
+    arrays = (*maps, *others)
     is_ours = all(x.size and x.dtype == jnp.float32 for x in (kernel, *arrays))
-    if vectors() == 0 or kernel.shape[:2] != (3, 3) or not is_ours:
+    fits = len({x.shape[:3] for x in arrays}) == 1
+    fits = fits and kernel.shape[:3] == (3, 3, sum(x.shape[3] for x in maps))
+    if vectors() == 0 or not is_ours or not fits:
         raise Unavailable

@@ -301,10 +301,10 @@ def gradients(
     maps: Sequence[jax.Array], kernel: jax.Array, changes: Sequence[jax.Array]
 ) -> tuple[jax.Array, jax.Array]:
     """Maps (B, H, W, .), (3, 3, I, O), the sums' gradients -> those of kernel and bias (O,)."""
-    check(kernel, *maps, *changes)
+    check(kernel, maps, changes)
     batch, height, width, _ = maps[0].shape
     channels = [tuple(x.shape[3] for x in arrays) for arrays in (maps, changes)]
-    if any(outputs % LANES for outputs in channels[1]):
+    if any(outputs % LANES for outputs in channels[1]) or sum(channels[1]) != kernel.shape[3]:
         raise Unavailable
     call = jax.ffi.ffi_call(
         made(_make_gradient, batch, height, width, *channels),

@@ -5,6 +5,7 @@ function that is being written. Pointers are moved by bytes. Vectors hold one fl
 channels; LLVM makes of them what the processor has.
 """
 
+import os
 import sys
 from collections.abc import Callable
 from math import factorial
@@ -13,6 +14,8 @@ from typing import Any, cast
 import numpy as np
 from llvmlite import binding, ir
 from numpy.polynomial import Chebyshev, Polynomial
+
+from firenet_jax.native.choice import SWITCH
 
 LANES = 16
 INT, INT32, FLOAT, POINTER = ir.IntType(64), ir.IntType(32), ir.FloatType(), ir.PointerType()
@@ -260,11 +263,20 @@ class Function:
         return self.fma(vector(2), self.sigmoid(self.b.fadd(x, x)), vector(-1))
 
 
+def _features() -> binding.FeatureMap:
+    """What this processor has, as far as it is to be used."""
+    features = binding.get_host_cpu_features()
+    if os.environ.get(SWITCH) == "avx2":
+        for name in features:
+            features[name] &= not name.startswith(("avx512", "avx10"))
+    return features
+
+
 def vectors() -> int:
     """How many vectors this processor's registers hold; 0 where nothing of this was tried."""
     if not binding.get_process_triple().startswith("x86_64") or sys.platform != "linux":
         return 0
-    features = binding.get_host_cpu_features()
+    features = _features()
     if features.get("avx512f"):
         return 32
     return 8 if features.get("avx2") and features.get("fma") else 0  # each in two of 16
@@ -273,24 +285,33 @@ def vectors() -> int:
 _engines = []  # what was compiled stays for as long as the process
 
 
-def compiled(module: Module) -> Callable[[str], int]:
-    """Compiles a module -> where its function of a name is; only public ones have names."""
+def machine() -> binding.TargetMachine:
+    """This processor, for LLVM."""
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
-    module.triple = binding.get_process_triple()
-    code = binding.parse_assembly(str(module))
-    code.link_in(binding.parse_assembly(CALL_POINTER))
-    machine = binding.Target.from_triple(module.triple).create_target_machine(
+    return binding.Target.from_triple(binding.get_process_triple()).create_target_machine(
         cpu=binding.get_host_cpu_name(),
         # Some processors have vectors of 512 bits of which LLVM would use only half.
-        features=binding.get_host_cpu_features().flatten() + ",-prefer-256-bit",
+        features=_features().flatten() + ",-prefer-256-bit",
         opt=2,
     )
+
+
+def optimised(module: Module, target: binding.TargetMachine) -> binding.ModuleRef:
+    module.triple = target.triple
+    code = binding.parse_assembly(str(module))
+    code.link_in(binding.parse_assembly(CALL_POINTER))
     passes = binding.create_pass_builder(
-        machine, binding.create_pipeline_tuning_options(speed_level=1)
+        target, binding.create_pipeline_tuning_options(speed_level=1)
     )
     passes.getModulePassManager().run(code, passes)
-    engine = binding.create_mcjit_compiler(code, machine)
+    return code
+
+
+def compiled(module: Module) -> Callable[[str], int]:
+    """Compiles a module -> where its function of a name is; only public ones have names."""
+    target = machine()
+    engine = binding.create_mcjit_compiler(optimised(module, target), target)
     engine.finalize_object()
     _engines.append(engine)
     return engine.get_function_address
