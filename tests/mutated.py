@@ -452,14 +452,16 @@ def run(seed: int, first: int, count: int, only: str = "") -> tuple[collections.
         watch = selectors.DefaultSelector()
         watch.register(worker.stdout, selectors.EVENT_READ)
         last, what = number, "ends the process"
+        ready = False  # its start is no input's fault
         while True:
-            if not watch.select(ASLEEP):
+            if not watch.select(ASLEEP if ready else None):
                 what = "sleeps"
                 worker.kill()
                 break
             line = worker.stdout.readline()
             if not line:
                 break
+            ready = True
             last, name, came = json.loads(line)
             if name == "begins":
                 continue
