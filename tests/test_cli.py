@@ -327,6 +327,27 @@ def test_settings_that_cannot_be_are_one_sentence(here, capsys, line, said):
     }  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    "line, said",
+    [
+        (f"{RUN} -N five", "-N/--events: expected a whole number, not 'five'"),
+        (f"{RUN} --pad 1.5", "--pad: expected a whole number, not '1.5'"),
+        (f"{RUN} -T fast", "--duration: expected a number, not 'fast'"),
+        (f"{RUN} --unit x", "--unit: expected s or ms or us or ns, not 'x'"),
+        (f"{RUN} --names x", "--names: expected number or nanoseconds, not 'x'"),
+        ("simulate -o set --noise 1 much", "--noise: expected 2 numbers, not '1 much'"),
+        ("train -o run --optimiser sgd", "--optimiser: expected muon or adam, not 'sgd'"),
+    ],
+)  # fmt: skip
+def test_words_that_cannot_be_read_are_said_without_pythons(here, capsys, monkeypatch, line, said):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as stop:
+        cli.main(line.split())
+    error = capsys.readouterr().err
+    assert stop.value.code == 2 and said in error
+    assert not re.search(r"NoneType|class|Traceback|int\b|float|Literal", error), error
+
+
 def test_colours_of_a_sensor_that_says_it_is_grey(here, capsys):
     words = np.array([[10, 1 | 2 << 14], [20, 3 | 4 << 14]], "<u4").tobytes()
     (here / "a.dat").write_bytes(b"% Version 2\n% Width 24\n% Height 20\n\x00\x08" + words)
