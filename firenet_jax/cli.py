@@ -133,7 +133,26 @@ def program() -> int:
     if sys.platform == "linux" and "GLIBC_TUNABLES" not in os.environ:
         os.environ["GLIBC_TUNABLES"] = HUGE_PAGES
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
-    return main()
+    for name in ("stdin", "stdout", "stderr"):  # one that is closed is None, and breaks libraries
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))
+    try:
+        code = main()
+    except SystemExit as stop:  # of the help and of what tyro cannot read
+        code = int(stop.code or 0)
+    return _said(code)
+
+
+def _said(code: int) -> int:
+    """The exit code, once what was printed has gone where it should."""
+    try:
+        sys.stdout.flush()
+        return code
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python will flush again
+        if not isinstance(error, BrokenPipeError):  # who reads no further, as `head`, knows that
+            print(f"firenet: error: cannot print ({error.strerror})", file=sys.stderr)
+        return code or 1
 
 
 def sentence(error: Exception, command: str) -> str | None:
@@ -174,8 +193,6 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"firenet: no command {arguments[0]!r}\n\n{usage()}", file=sys.stderr)
         return 2
 
-    from firenet_jax.commands import options
-
     logging.basicConfig(format="firenet: %(message)s", level=logging.WARNING)
     name, rest = arguments[0], arguments[1:]
     _keep_freed_memory() if name == "train" else _return_freed_memory()
@@ -188,6 +205,8 @@ def main(arguments: list[str] | None = None) -> int:
             )
             return 2
     try:
+        from firenet_jax.commands import options
+
         command = importlib.import_module(module)
         kind = getattr(command, settings)
         command.run(options.parse(kind, rest, f"firenet {name}", inspect.getdoc(kind) or ""))

@@ -11,6 +11,7 @@ import pickle
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -100,6 +101,25 @@ def test_help_follows_the_order_of_the_settings(capsys, monkeypatch):
         (Path("a"), Path("b")), Path("out"), windows=Windows(duration=5),
         network=Network(recurrent=False, pad=4), batch=2,
     )  # fmt: skip
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
+@pytest.mark.parametrize("line", ["--help", "convert --help"])
+def test_what_cannot_be_printed_is_one_sentence(line):
+    command = [sys.executable, "-m", "firenet_jax.cli", *line.split()]
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
+    run = partial(subprocess.run, env=environment, stderr=subprocess.PIPE, text=True)
+    with open("/dev/full", "w") as full:
+        ran = run(command, stdout=full)
+    assert ran.returncode == 1
+    assert ran.stderr == "firenet: error: cannot print (No space left on device)\n"
+    reading, writing = os.pipe()
+    os.close(reading)  # as `| head` does when it has seen enough
+    with open(writing, "w") as pipe:
+        ran = run(command, stdout=pipe)
+    assert (ran.returncode, ran.stderr) == (1, "")
+    closed = ["sh", "-c", 'exec "$0" "$@" <&- >&- 2>&-', *command]
+    assert run(closed).returncode == 0
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only glibc has this setting")
