@@ -166,7 +166,7 @@ def sentence(error: Exception, command: str) -> str | None:
                 f'pip install "firenet-jax[{extra}]"'
             )
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
-        return "not enough memory: ask for a smaller sensor, chunk, crop or batch"
+        return "not enough memory: ask for a smaller sensor, chunk, crop, pad or batch"
     if isinstance(error, PermissionError) and error.filename:
         from firenet_jax.storage.files import forbidden
 

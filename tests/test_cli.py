@@ -331,6 +331,7 @@ def test_options_of_the_original_program_are_explained(here, capsys):
         (f"{RUN} -N 5 --step 1.5", "pass a whole number"), (f"{RUN} --longest 0", "longest is 0.0"),
         (f"{RUN} -T 5 --step 9", "longer than the window"), (f"{RUN} --start -1", "start is -1.0"),
         (f"{RUN} --frame-to-frame --step 3", "not those between frames"),
+        (f"{RUN} --chunk 9000 --batch 4", "fewer than 32768 windows fit at once"),
         (f"{RUN} --rate 0", "rate is 0"), (f"{RUN} --rate 5 --triggers", "choose one of --rate"),
         ("evaluate a.txt -o out -N 0", "events is 0"),
         ("evaluate a.txt -o out --start -2", "start is -2.0"),
