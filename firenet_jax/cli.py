@@ -132,7 +132,8 @@ def program() -> int:
     """
     if sys.platform == "linux" and "GLIBC_TUNABLES" not in os.environ:
         os.environ["GLIBC_TUNABLES"] = HUGE_PAGES
-        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+        with contextlib.suppress(OSError):  # it may not be started again: then without
+            os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
     for name in ("stdin", "stdout", "stderr"):  # one that is closed is None, and breaks libraries
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))
