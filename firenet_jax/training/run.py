@@ -83,6 +83,7 @@ def run(settings: Train, stop: int | None = None) -> None:
         best, last_save = log.best(), time.monotonic()
         last = min(settings.steps, stop or settings.steps)
         with (
+            contextlib.closing(log),
             bar(last, "step", quiet=not is_first(), initial=done) as progress,
             _interruptible() as interrupted,
         ):
@@ -102,7 +103,6 @@ def run(settings: Train, stop: int | None = None) -> None:
                     last_save = time.monotonic()
         if interrupted and saved.latest_step() != done:
             saved.save(done, args=ocp.args.StandardSave(state))
-        log.close()
     if interrupted:
         raise KeyboardInterrupt(f"step {done} is saved: the same command goes on from there")
     if is_first():
