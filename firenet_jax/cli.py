@@ -120,8 +120,28 @@ def program() -> int:
     """
     if sys.platform == "linux" and "GLIBC_TUNABLES" not in os.environ:
         os.environ["GLIBC_TUNABLES"] = HUGE_PAGES
-        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
-    return main()
+        with contextlib.suppress(OSError):  # it may not be started again: then without
+            os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+    for name in ("stdin", "stdout", "stderr"):  # one that is closed is None, and breaks libraries
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))
+    try:
+        code = main()
+    except SystemExit as stop:  # of the help and of what tyro cannot read
+        code = int(stop.code or 0)
+    return _said(code)
+
+
+def _said(code: int) -> int:
+    """The exit code, once what was printed has gone where it should."""
+    try:
+        sys.stdout.flush()
+        return code
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python will flush again
+        if not isinstance(error, BrokenPipeError):  # who reads no further, as `head`, knows that
+            print(f"firenet: error: cannot print ({error.strerror})", file=sys.stderr)
+        return code or 1
 
 
 def sentence(error: Exception, command: str) -> str | None:
@@ -135,7 +155,7 @@ def sentence(error: Exception, command: str) -> str | None:
                 f'pip install "firenet-jax[{extra}]"'
             )
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
-        return "not enough memory: ask for a smaller sensor, chunk, crop or batch"
+        return "not enough memory: ask for a smaller sensor, chunk, crop, pad or batch"
     if isinstance(error, PermissionError) and error.filename:
         from firenet_jax.storage.files import forbidden
 
@@ -162,8 +182,6 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"firenet: no command {arguments[0]!r}\n\n{usage()}", file=sys.stderr)
         return 2
 
-    from firenet_jax.commands import options
-
     logging.basicConfig(format="firenet: %(message)s", level=logging.WARNING)
     name, rest = arguments[0], arguments[1:]
     _set_malloc(KEEP_FREED_MEMORY if name == "train" else RETURN_FREED_MEMORY)
@@ -176,6 +194,8 @@ def main(arguments: list[str] | None = None) -> int:
             )
             return 2
     try:
+        from firenet_jax.commands import options
+
         command = importlib.import_module(module)
         kind = getattr(command, settings)
         command.run(options.parse(kind, rest, f"firenet {name}", inspect.getdoc(kind) or ""))

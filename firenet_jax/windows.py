@@ -164,9 +164,10 @@ def warn_if_unusual(events: float, pixels: int) -> None:
     density = events / pixels
     if not 0.1 <= density <= 1.5:
         logger.warning(
-            "%d events per window are %s per pixel: fewer than 0.1 give noisy and faint images, "
+            "%s per window %s %s per pixel: fewer than 0.1 give noisy and faint images, "
             "more than 1.5 smeared ones; 0.35 (%d events) is usual for this sensor",
-            events, f"{density:,.0f}" if density >= 100 else f"{density:.3g}", round(0.35 * pixels),
+            counted(round(events), "event"), "is" if events == 1 else "are",
+            f"{density:,.0f}" if density >= 100 else f"{density:.3g}", round(0.35 * pixels),
         )  # fmt: skip
 
 

@@ -31,7 +31,8 @@ from firenet_jax.errors import FirenetError
 
 SLOW = 60.0  # seconds of the processor's time
 ASLEEP = 600.0  # seconds of the clock
-AT_ONCE = 500  # inputs that one worker reads: libraries keep a little of what they have opened
+AT_ONCE = 2500  # inputs that one worker reads: libraries keep a little of what they have opened
+STATE = {"kernel": np.ones((3, 4), np.float32), "count": np.int32(3)}  # of a checkpoint
 NASTY = [
     b"nan", b"-1", b"1e999", b"9" * 400, "١٢٣".encode(), b"\x0c", b"\x00", b"\xff\xfe", b"0x10",
     b"", b" ", b",", b"\n", b"\r", b'"', b"..", b"{", b"[" * 2000, b"1_000", b"\xef\xbb\xbf",
@@ -115,10 +116,13 @@ def inputs(folder: Path) -> dict[str, Path]:
         made(f"wire.{name}", np.zeros(40, kind).tobytes())
     made("times.txt", "".join(f"{k / 30:.6f} 0.1 0.2\n" for k in range(30)).encode())
     made("stamps.csv", b"#timestamp [ns],filename\n33300000,a.png\n66600000,b.png\n")
+    _unfinished(folder, found)
     entry = {"step": 1, "kind": "validation", "loss": 0.5, "seconds": 1.0}
     made("log.jsonl", "".join(json.dumps(entry | {"step": k}) + "\n" for k in range(20)).encode())
     if samples := os.environ.get("FIRENET_RECORDINGS"):
-        beginnings = {"davis346_frames.aedat4": None, "dvxplorer_face.aedat4": 60_000,
+        beginnings = {"davis346_frames.aedat4": None, "ncars.dat": None,
+                      "e2vid_slider_depth.zip": None, "ncaltech101_faces_easy_0001.bin": 20_000,
+                      "dvxplorer_face.aedat4": 60_000,
                       "ros1_event_camera_msgs.bag": None, "evt2_sparklers.raw": 20_000,
                       "dvs_synthetic_sweep.es": 20_000, "davis346_59_frames.aedat4": 150_000,
                       "evt3_driving.raw": 20_000, "davis240_boxes.aedat": 200_000,
@@ -127,7 +131,7 @@ def inputs(folder: Path) -> dict[str, Path]:
             if (Path(samples) / name).is_file():
                 made(Path(name).name, (Path(samples) / name).read_bytes()[:size])
     if reference := os.environ.get("FIRENET_REFERENCE"):
-        for path in Path(reference).glob("*.pth"):
+        for path in Path(reference).glob("*.pth*"):
             if path.stat().st_size < 1 << 20:
                 made(path.name, path.read_bytes())
     return found
@@ -162,6 +166,29 @@ def _arrays(folder: Path, found: dict[str, Path], t, x, y, p) -> None:
         if path.name in ("rows.npy", "fields.npy", "events.npz", "dsec.h5", "mvsec.h5", "v2e.h5",
                          "metavision.h5"):  # fmt: skip
             found[path.name] = path
+
+
+def _unfinished(folder: Path, found: dict[str, Path]) -> None:
+    """What interrupted runs leave: pictures and a position, a note on a video, a checkpoint."""
+    import orbax.checkpoint as ocp
+
+    from firenet_jax.storage.resume import keep_position, mark_done, publish_position
+    from firenet_jax.storage.video import FolderWriter
+
+    output = folder / "unfinished/out"
+    output.parent.mkdir()
+    writer = FolderWriter(output, at_times=True)
+    for number in range(3):
+        writer.write(np.zeros((20, 24), np.uint8), 1000 * number, 10)
+    writer.flush()
+    writer.holding.close()
+    keep_position(output, {"seed": 0}, 3, 3, state0=np.zeros((4, 5), np.float32))
+    publish_position(output, 3)
+    output.with_name("video.gif").write_bytes(b"whole")
+    mark_done(output.with_name("video.gif"), {"seed": 0})
+    with ocp.CheckpointManager(folder / "checkpoint") as saved:
+        saved.save(3, args=ocp.args.StandardSave(STATE))
+    found |= {"unfinished": output.parent, "checkpoint": folder / "checkpoint"}
 
 
 def _newer(made, t: list, x: list, y: list, p: list) -> None:
@@ -208,8 +235,28 @@ def _newer(made, t: list, x: list, y: list, p: list) -> None:
         told = b"storage_identifier: ''\nrelative_file_paths:\n- a.mcap\n"
         made(f"bag_{name}/metadata.yaml", told)
         made(f"bag_{name}/a.mcap", f.mcap(chunks, pack=pack, how=how))
+    made("bag_sqlite/metadata.yaml", told.replace(b"mcap", b"db3"))
+    _sqlite(made("bag_sqlite/a.db3", b""), [message for chunk in chunks for message in chunk])
     words = [0x80000001, 0x10000803, 0xA0000101, 0x00001004] * 20
     made("two.raw", b"% evt 2.0\n% geometry 1280x720\n% end\n" + np.array(words, "<u4").tobytes())
+
+
+def _sqlite(path: Path, messages: list) -> None:
+    import sqlite3
+
+    name, kind = "/event_camera/events", "event_camera_msgs/msg/EventPacket"
+    with contextlib.closing(sqlite3.connect(path)) as file, file:
+        file.execute(
+            "create table topics (id integer primary key, name text, type text,"
+            " serialization_format text, offered_qos_profiles text)"
+        )
+        file.execute(
+            "create table messages (id integer primary key, topic_id integer,"
+            " timestamp integer, data blob)"
+        )
+        file.execute("insert into topics values (1, ?, ?, 'cdr', '')", (name, kind))
+        rows = [(time, data) for time, data in messages]
+        file.executemany("insert into messages (topic_id, timestamp, data) values (1, ?, ?)", rows)
 
 
 def _params():
@@ -275,6 +322,10 @@ def read(name: str, path: Path) -> None:
         )  # fmt: skip
     elif name == "resume.npz":
         read_arrays(path)
+    elif name == "unfinished":
+        _go_on(path / "out")
+    elif name == "checkpoint":
+        _restore(path)
     elif name in ("times.txt", "stamps.csv"):
         read_times(path)
     elif name == "settings.json":
@@ -284,7 +335,7 @@ def read(name: str, path: Path) -> None:
         pieces = (data[start : start + 100] for start in range(0, len(data), 100))
         for _ in sources.decoded(pieces, name.removeprefix("wire.")):
             pass
-    elif name == "weights.npz" or name.endswith(".pth"):
+    elif name == "weights.npz" or name.endswith((".pth", ".tar")):
         load_weights(path)
     elif name.startswith("clip"):
         for _ in dataset.read_clip(path):
@@ -304,6 +355,31 @@ def read(name: str, path: Path) -> None:
         if recording.frames is not None:
             for number in range(min(3, len(recording.frames.times))):
                 recording.frames.read(number)
+
+
+def _go_on(output: Path) -> None:
+    """As `reconstruct` does after an interruption, to the end."""
+    from firenet_jax.storage.resume import is_done, read_position
+    from firenet_jax.storage.video import FolderWriter, check_output
+
+    check_output(output, overwrite=False)
+    is_done(output.with_name("video.gif"), {"seed": 0})
+    saved = read_position(output, {"seed": 0}, overwrite=False)
+    writer = FolderWriter(output, at_times=True)
+    if saved is not None:
+        writer.keep(int(saved["pictures"]))
+    writer.write(np.zeros((20, 24), np.uint8), 4000, 10)
+    writer.finish()
+
+
+def _restore(folder: Path) -> None:
+    import orbax.checkpoint as ocp
+
+    from firenet_jax.training.run import restored
+
+    with ocp.CheckpointManager(folder) as saved:
+        if saved.latest_step() is not None:
+            restored(saved, STATE)
 
 
 def one(seed: int, number: int, whole: dict[str, Path], folder: Path) -> tuple[str, str]:
@@ -376,14 +452,16 @@ def run(seed: int, first: int, count: int, only: str = "") -> tuple[collections.
         watch = selectors.DefaultSelector()
         watch.register(worker.stdout, selectors.EVENT_READ)
         last, what = number, "ends the process"
+        ready = False  # its start is no input's fault
         while True:
-            if not watch.select(ASLEEP):
+            if not watch.select(ASLEEP if ready else None):
                 what = "sleeps"
                 worker.kill()
                 break
             line = worker.stdout.readline()
             if not line:
                 break
+            ready = True
             last, name, came = json.loads(line)
             if name == "begins":
                 continue

@@ -53,14 +53,42 @@ for limit, line in json.loads(sys.argv[1]):
 """
 
 
-def with_little_room(folder, *lines):
-    """(limit of a file's size, command line), ... -> [(exit code, lines said), ...].
+# A disk of 1 MB, filled up but for so many bytes, whole pages; what the commands read lies outside.
+ON_A_DISK = """
+import json, os, shutil, sys
+import h5py, jax, orbax.checkpoint
+from firenet_jax import cli
+inputs, disk = os.getcwd(), sys.argv[2]
+os.chdir(disk)
+for room, line in json.loads(sys.argv[1]):
+    for name in os.listdir(disk):
+        shutil.rmtree(name) if os.path.isdir(name) and not os.path.islink(name) else os.remove(name)
+    for name in os.listdir(inputs):
+        os.symlink(os.path.join(inputs, name), name)
+    state = os.statvfs(disk)
+    with open("filler", "wb") as file:
+        file.write(bytes((state.f_bavail - room // state.f_frsize) * state.f_frsize))
+    code = cli.main(line.split())
+    left = [path for path in os.listdir(disk) if not os.path.islink(path) and path != "filler"]
+    print(f"exit code {code} {json.dumps(left)}", file=sys.stderr, flush=True)
+"""
+MOUNTED = 'mount -t tmpfs -o size=1m none "$2" && exec "$0" -c "$3" "$1" "$2"'
 
-    One process runs them all, which compiles their programs once. A limit stands for a full disk:
-    it needs no rights, and the libraries in C meet it where they write.
+
+def with_little_room(folder, *lines, disk=None):
+    """(bytes there are room for, command line), ... -> [(exit code, lines said), ...].
+
+    One process runs them all, which compiles their programs once. A limit of a file's size stands
+    for a full disk: it needs no rights, and the libraries in C meet it where they write. disk: a
+    folder where a real one of 1 MB is mounted instead, for the commands alone; each exit code
+    then comes with the names that are left there.
     """
+    command = [sys.executable, "-c", LIMITED, json.dumps(lines)]
+    if disk is not None:
+        shell = ["unshare", "-rm", "sh", "-c", MOUNTED]
+        command = [*shell, sys.executable, json.dumps(lines), str(disk), ON_A_DISK]
     ran = subprocess.run(
-        [sys.executable, "-c", LIMITED, json.dumps(lines)],
+        command,
         cwd=folder, capture_output=True, text=True, timeout=900,
         # The limit would hold for the files of compiled programs that tests share, too.
         env=os.environ | {
@@ -72,7 +100,10 @@ def with_little_room(folder, *lines):
     results, said = [], []
     for line in ran.stderr.strip().splitlines():
         if line.startswith("exit code "):
-            results.append((int(line.removeprefix("exit code ")), said))
+            code, _, left = line.removeprefix("exit code ").partition(" ")
+            results.append(
+                (int(code), said) if disk is None else (int(code), said, json.loads(left))
+            )
             said = []
         else:
             said.append(line)

@@ -11,6 +11,7 @@ import pickle
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -100,6 +101,25 @@ def test_help_follows_the_order_of_the_settings(capsys, monkeypatch):
         (Path("a"), Path("b")), Path("out"), windows=Windows(duration=5),
         network=Network(recurrent=False, pad=4), batch=2,
     )  # fmt: skip
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
+@pytest.mark.parametrize("line", ["--help", "convert --help"])
+def test_what_cannot_be_printed_is_one_sentence(line):
+    command = [sys.executable, "-m", "firenet_jax.cli", *line.split()]
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
+    run = partial(subprocess.run, env=environment, stderr=subprocess.PIPE, text=True)
+    with open("/dev/full", "w") as full:
+        ran = run(command, stdout=full)
+    assert ran.returncode == 1
+    assert ran.stderr == "firenet: error: cannot print (No space left on device)\n"
+    reading, writing = os.pipe()
+    os.close(reading)  # as `| head` does when it has seen enough
+    with open(writing, "w") as pipe:
+        ran = run(command, stdout=pipe)
+    assert (ran.returncode, ran.stderr) == (1, "")
+    closed = ["sh", "-c", 'exec "$0" "$@" <&- >&- 2>&-', *command]
+    assert run(closed).returncode == 0
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only glibc has this setting")
@@ -314,6 +334,7 @@ def test_options_of_the_original_program_are_explained(here, capsys):
         (f"{RUN} -N 5 --step 1.5", "pass a whole number"), (f"{RUN} --longest 0", "longest is 0.0"),
         (f"{RUN} -T 5 --step 9", "longer than the window"), (f"{RUN} --start -1", "start is -1.0"),
         (f"{RUN} --frame-to-frame --step 3", "not those between frames"),
+        (f"{RUN} --chunk 9000 --batch 4", "fewer than 32768 windows fit at once"),
         (f"{RUN} --rate 0", "rate is 0"), (f"{RUN} --rate 5 --triggers", "choose one of --rate"),
         ("evaluate a.txt -o out -N 0", "events is 0"),
         ("evaluate a.txt -o out --start -2", "start is -2.0"),
@@ -328,6 +349,27 @@ def test_settings_that_cannot_be_are_one_sentence(here, capsys, line, said):
     assert error.startswith("firenet: error: ") and {p.name for p in here.iterdir()} == {
         "a.txt", "weights.npz"
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "line, said",
+    [
+        (f"{RUN} -N five", "-N/--events: expected a whole number, not 'five'"),
+        (f"{RUN} --pad 1.5", "--pad: expected a whole number, not '1.5'"),
+        (f"{RUN} -T fast", "--duration: expected a number, not 'fast'"),
+        (f"{RUN} --unit x", "--unit: expected s or ms or us or ns, not 'x'"),
+        (f"{RUN} --names x", "--names: expected number or nanoseconds, not 'x'"),
+        ("simulate -o set --noise 1 much", "--noise: expected 2 numbers, not '1 much'"),
+        ("train -o run --optimiser sgd", "--optimiser: expected muon or adam, not 'sgd'"),
+    ],
+)  # fmt: skip
+def test_words_that_cannot_be_read_are_said_without_pythons(here, capsys, monkeypatch, line, said):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as stop:
+        cli.main(line.split())
+    error = capsys.readouterr().err
+    assert stop.value.code == 2 and said in error
+    assert not re.search(r"NoneType|class|Traceback|int\b|float|Literal", error), error
 
 
 def test_colours_of_a_sensor_that_says_it_is_grey(here, capsys):

@@ -1,5 +1,6 @@
 """A disk that becomes full, in all commands that write: one sentence, and nothing half-written."""
 
+import subprocess
 import sys
 
 import h5py
@@ -8,6 +9,7 @@ import pytest
 from processes import with_little_room
 from test_pipeline import write_recording
 
+from firenet_jax.export.web_page import FILES
 from firenet_jax.storage.video import write_video
 
 
@@ -31,6 +33,10 @@ def make_inputs(folder):
     sequence(folder / "a.h5")
     pictures = np.random.default_rng(0).integers(0, 256, (8, 48, 64), np.uint8)
     write_video(folder / "clip.mp4", pictures)
+    (folder / "runtime/dist").mkdir(parents=True)
+    (folder / "runtime/package.json").write_text('{"version": "1.30.0"}')
+    for name in FILES:
+        (folder / "runtime/dist" / name).write_bytes(bytes(60_000))
 
 
 SIMULATE = "--sequences 1 --validation 0 --seconds 0.2 --sensor-size 64x48"
@@ -53,7 +59,8 @@ TRIALS = {
     "export": [
         (f"-o model{suffix}", 20_000, f"model{suffix}")
         for suffix in (".onnx", ".stablehlo", ".pth", ".safetensors")
-    ],
+    ]
+    + [("--web page --runtime runtime --sample a.txt", 50_000, "page")],
     "simulate": [
         (SIMULATE + " -o one", 3_000, "one/train/000000.h5"),
         (SIMULATE + " -o two", 30_000, "two/train/000000.h5"),
@@ -88,3 +95,29 @@ def test_one_sentence_and_nothing_half_written(tmp_path, request, command):
         why = "disk I/O error" if output.endswith(".ros2") else "File too large"
         assert why in errors[0], errors
         assert not (tmp_path / output).exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a disk in memory is mounted there")
+@pytest.mark.slow
+@pytest.mark.parametrize("command", TRIALS)
+def test_on_a_disk_of_a_megabyte(tmp_path, request, command):
+    """The same, where the disk is really full: all that a command writes shares it."""
+    if subprocess.run(["unshare", "-rm", "true"], capture_output=True).returncode:
+        pytest.skip("this user may not mount anything")
+    inputs, disk = tmp_path / "inputs", tmp_path / "disk"
+    inputs.mkdir()
+    disk.mkdir()
+    make_inputs(inputs)
+    reference = request.getfixturevalue("reference") if command == "convert" else None
+    lines = [
+        (limit, f"{command} {line.format(reference=reference)}")
+        for line, limit, _ in TRIALS[command]
+    ]
+    ran = with_little_room(inputs, *lines, disk=disk)
+    for (code, said, left), (line, _, output) in zip(ran, TRIALS[command], strict=True):
+        assert code == 1, (line, said)
+        errors = [each for each in said if each.startswith("firenet: error: ")]
+        assert len(errors) == 1 and said[-1] == errors[0], (line, said)
+        assert not any("Traceback" in each or "Exception" in each for each in said), said
+        assert any(why in errors[0] for why in ("No space left", "disk is full")), errors
+        assert output.partition("/")[0] not in left or "/" in output, (line, left)

@@ -1,7 +1,14 @@
 """Progress: percent and the time left, a line a minute where there is no terminal."""
 
+import gzip
+import os
 import re
+import zipfile
 
+import numpy as np
+import pytest
+
+from firenet_jax.readers import open_recording
 from firenet_jax.storage import progress
 from firenet_jax.storage.progress import Bytes, bar
 
@@ -44,3 +51,46 @@ def test_bytes_read_of_bytes(tmp_path):
     with open(tmp_path / "a.bin", "rb") as file:
         file.read()
         assert read.read() == 4000
+
+
+def shares(path):
+    """How much of a file is said to be read when each chunk of its events has come."""
+    recording, read = open_recording(path), Bytes([path])
+    found = [(len(chunk), read.read() / read.total) for chunk in recording.events()]
+    return [share for _, share in found], sum(count for count, _ in found)
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fdinfo"), reason="a system that does not tell")
+@pytest.mark.parametrize("name", ["a.txt", "a.zip", "a.txt.gz"])
+def test_texts_are_read_by_percent(tmp_path, name):
+    rng, count = np.random.default_rng(0), 400_000
+    columns = np.sort(rng.random(count)), rng.integers(0, 240, count), rng.integers(0, 180, count)
+    rows = [f"{t:.6f} {x} {y} {k % 2}" for k, (t, x, y) in enumerate(zip(*columns, strict=True))]
+    text = "240 180\n" + "\n".join(rows) + "\n"
+    if name == "a.zip":
+        with zipfile.ZipFile(tmp_path / name, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("events.txt", text)
+    else:
+        data = text.encode()
+        (tmp_path / name).write_bytes(gzip.compress(data) if name.endswith("gz") else data)
+    reached, events = shares(tmp_path / name)
+    assert events == count and reached == sorted(reached)
+    assert len(set(reached)) > 1 and reached[0] < 1 and reached[-1] > 0.9
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fdinfo"), reason="a system that does not tell")
+@pytest.mark.parametrize(
+    "name",
+    ["evt2_sparklers.raw", "evt3_driving.raw", "davis346_59_frames.aedat4", "davis240_boxes.aedat",
+     "dvs_synthetic_sweep.es", "ros1_event_camera_msgs.bag", "ros2_mcap",
+     "ros2_event_camera_msgs",
+     "e2vid_slider_depth.zip", "ecd_slider_depth", "ncars.dat",
+     "ncaltech101_faces_easy_0001.bin"],
+)  # fmt: skip
+def test_recordings_are_read_by_percent_or_know_their_events(recordings, name):
+    recording = open_recording(recordings / name)
+    if recording.count is not None:
+        assert sum(map(len, recording.events())) == recording.count
+        return
+    reached, _ = shares(recordings / name)
+    assert reached == sorted(reached) and reached[-1] > 0.7  # at the last chunk; more may follow

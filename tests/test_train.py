@@ -3,9 +3,11 @@ import itertools
 import json
 import signal
 import sys
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +18,7 @@ from processes import COMPILES_SOON, finish, start, together
 
 from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.commands.simulate import Picture, write_sequence
+from firenet_jax.errors import OutputError
 from firenet_jax.events import Events
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.simulation.scenes import SceneSettings
@@ -84,8 +87,11 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(tmp_path, monkeypatch, 
 
 TOGETHER = """
 import sys
+import time
 from pathlib import Path
+from unittest.mock import Mock
 from firenet_jax.commands.simulate import Picture, write_sequence
+from firenet_jax.errors import OutputError
 from firenet_jax.events import Events
 from firenet_jax.training.losses import Loss
 from firenet_jax.simulation.scenes import SceneSettings
@@ -350,6 +356,22 @@ def test_a_damaged_log_keeps_what_is_whole(tmp_path):
         '{"step": 1, "kind": "validation", "loss": NaN}\n{"step": 2}\n'
     )
     assert Log(tmp_path, 5).best() == float("inf")
+
+
+def test_curves_that_cannot_be_written_are_said_and_hold_nothing_up(tmp_path, caplog, monkeypatch):
+    """They are written by a thread, which a full disk ends: the queue would fill, and wait."""
+    refused = Mock(side_effect=OSError(28, "No space left on device"))
+    log = Log(tmp_path, 0)
+    with monkeypatch.context() as patch:
+        patch.setattr("tensorboardX.record_writer.RecordWriter.write", refused)
+        log.write(1, "train", {str(k): k for k in range(40)})
+        until = time.monotonic() + 60
+        while log.failed is None and time.monotonic() < until:
+            time.sleep(0.01)
+        with pytest.raises(OutputError, match="tensorboard: cannot write .No space left"):
+            log.write(2, "train", {"loss": 1.0})
+        log.close()
+    assert "curves are not whole (No space left on device)" in caplog.text
 
 
 def test_a_short_run_warms_up_in_fewer_steps(tmp_path):

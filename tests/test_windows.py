@@ -176,7 +176,8 @@ def test_a_step_beyond_the_window_would_lose_events(fields):
 
 @pytest.mark.parametrize(
     "count, said", [(9, "9 events per window are 0.09 per pixel"), (10, ""), (35, ""), (150, ""),
-                    (151, "are 1.51 per pixel"), (12_345, "are 123 per pixel")],
+                    (151, "are 1.51 per pixel"), (12_345, "12,345 events per window are 123 per"),
+                    (1, "1 event per window is 0.01 per pixel")],
 )  # fmt: skip
 def test_unusual_windows_are_said(caplog, count, said):
     cut(recording_of([], height=10, width=10), Windows(events=count))

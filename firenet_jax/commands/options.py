@@ -75,15 +75,48 @@ def _plain(hint: Any, text: str, required: bool) -> Any:
     said: dict[str, Any] = {"help": text}
     if not required:  # tyro's place for the default: an empty one after a text can make a line
         said = {"help_behavior_hint": lambda default: text + _in_words(default)}
-    inner = kind
-    if typing.get_origin(kind) in (types.UnionType, typing.Union):
-        inner = next(part for part in typing.get_args(kind) if part is not types.NoneType)
-        if typing.get_origin(inner) is typing.Literal:
-            said["metavar"] = f"{{{','.join(typing.get_args(inner))}}}"
-    parts = typing.get_args(inner) if typing.get_origin(inner) is tuple else (inner,)
+    whole = kind
+    if types.NoneType in typing.get_args(kind):
+        kind = next(part for part in typing.get_args(kind) if part is not types.NoneType)
+    parts = typing.get_args(kind) if typing.get_origin(kind) is tuple else (kind,)
     if all(part in METAVARS for part in parts):
         said["metavar"] = " ".join(METAVARS[part] for part in parts).replace(" ...", "...")
-    return Annotated[kind, tyro.conf.arg(**said), *extras]
+    if set(parts) <= {int, float}:
+        return Annotated[Any, tyro.conf.arg(**said), _read_as(said["metavar"], parts), *extras]
+    if typing.get_origin(kind) is typing.Literal:
+        choices = typing.get_args(kind)
+        said["metavar"] = f"{{{','.join(choices)}}}"
+        return Annotated[Any, tyro.conf.arg(**said), _read_as(said["metavar"], choices), *extras]
+    return Annotated[whole, tyro.conf.arg(**said), *extras]
+
+
+def _read_as(metavar: str, parts: tuple) -> tyro.constructors.PrimitiveConstructorSpec:
+    """How the words after an option are read: one of some words, or as many numbers as there are
+    types. tyro's own way names classes of Python where a word is none of these."""
+
+    def numbers(words: list[str]) -> Any:
+        try:
+            values = tuple(part(word) for part, word in zip(parts, words, strict=True))
+        except ValueError as error:
+            whole = "a whole number" if set(parts) == {int} else "a number"
+            expected = whole if len(parts) == 1 else f"{len(parts)} numbers"
+            raise ValueError(f"expected {expected}, not {' '.join(words)!r}") from error
+        return values if len(parts) > 1 else values[0]
+
+    def choice(words: list[str]) -> str:
+        if words[0] not in parts:
+            raise ValueError(f"expected {' or '.join(parts)}, not {words[0]!r}")
+        return words[0]
+
+    def back(value: Any) -> list[str]:
+        return [str(part) for part in (value if isinstance(value, tuple) else [value])]
+
+    of_words = all(isinstance(part, str) for part in parts)
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1 if of_words else len(parts), metavar=metavar,
+        instance_from_str=choice if of_words else numbers,
+        is_instance=lambda value: True, str_from_instance=back,
+    )  # fmt: skip
 
 
 def _in_words(default: str) -> str:

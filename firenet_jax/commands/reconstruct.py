@@ -136,6 +136,11 @@ class Reconstruct:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise SettingsError(f"{name} is {value}, but must be more than 0")
+        if (self.chunk or 1) * (self.batch or 1) >= 2**15:  # `pack` would say it, after a minute
+            raise SettingsError(
+                f"chunk is {self.chunk or 1} and batch {self.batch or 1}, but fewer than 32768 "
+                "windows fit at once"
+            )
         if self.network.pad < 1:
             raise SettingsError(f"pad is {self.network.pad}, but pads to a multiple of 1 or more")
         if not self.recordings:

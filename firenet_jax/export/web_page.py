@@ -19,7 +19,7 @@ import numpy as np
 from firenet_jax.events import Events
 from firenet_jax.export.onnx_model import onnx_model
 from firenet_jax.network import Weights
-from firenet_jax.storage.files import OutputError, writing
+from firenet_jax.storage.files import OutputError, partial_name, writing
 
 RUNTIME = "onnxruntime-web"
 # Both ways to run: on a GPU, and where there is none.
@@ -54,12 +54,19 @@ def write_page(folder: Path, weights: Weights, sample: Events, height: int, widt
     """Writes the folder. Raises OutputError where onnx or the runtime is missing, or no room."""
     runtime_version(runtime)
     model = onnx_model(weights, picture=True).SerializeToString()
+    beside = partial_name(folder)
     with writing(folder):
-        (folder / "ort").mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(beside, ignore_errors=True)
+        (beside / "ort").mkdir(parents=True)
         for page in importlib.resources.files("firenet_jax.export").joinpath("page").iterdir():
-            (folder / page.name).write_bytes(page.read_bytes())
-        (folder / "firenet.onnx").write_bytes(model)
+            (beside / page.name).write_bytes(page.read_bytes())
+        (beside / "firenet.onnx").write_bytes(model)
         columns: dict[str, Any] = {"t": sample.t, "x": sample.x, "y": sample.y, "p": sample.p}
-        np.savez_compressed(folder / "sample.npz", **columns, width=width, height=height)
+        np.savez_compressed(beside / "sample.npz", **columns, width=width, height=height)
         for name in FILES:
-            shutil.copyfile(runtime / "dist" / name, folder / "ort" / name)
+            shutil.copyfile(runtime / "dist" / name, beside / "ort" / name)
+        for path in [path for path in beside.rglob("*") if path.is_file()]:
+            place = folder / path.relative_to(beside)  # what else lies in the folder stays
+            place.parent.mkdir(parents=True, exist_ok=True)
+            path.replace(place)
+        shutil.rmtree(beside)

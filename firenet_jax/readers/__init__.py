@@ -99,9 +99,9 @@ def open_recording(
             break
     else:
         raise RecordingError(
-            f"{path}: not a recording of a known format: expected text or zip, an ECD or EVREAL "
-            "folder, HDF5, .npy, .npz, N-Caltech101 .bin, .dat, .raw, .aedat, .aedat4, .es, or a "
-            "ROS bag"
+            f"{path}: not a recording of a known format: expected text (.txt, .csv) or zip, "
+            "an ECD or EVREAL folder, HDF5, .npy, .npz, N-Caltech101 .bin, .dat, .raw, .aedat, "
+            ".aedat4, .es, or a ROS bag"
         )
     said = 0
 

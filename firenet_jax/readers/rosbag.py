@@ -208,11 +208,24 @@ def _size(message: _Message) -> tuple[int, int]:
 def _events(path: Path, topic: str, arrays: bool) -> Iterator[Events | Rows]:
     row, ros2 = 0, not _is_ros1(path)
     with reading(path, Exception), _bag(path) as bag:
-        messages = (_Message(raw, ros2) for _, raw in _raw(bag, topic))
+        messages = (_Message(raw, ros2) for raw in _placed(path, _raw(bag, topic)))
         for columns in _array_columns(messages) if arrays else _packet_columns(path, messages):
             events = to_events(path, row, *columns)
             row += len(events)
             yield events
+
+
+def _placed(path: Path, messages: Iterator[tuple[int, bytes]]) -> Iterator[bytes]:
+    """The bytes of messages. sqlite leaves no place in its file that tells how far it has come
+    (`storage.progress`), so a file that we open stands there."""
+    largest = max(_files(path) if path.is_dir() else [path], key=lambda file: file.stat().st_size)
+    if largest.suffix.lower() != ".db3":
+        yield from (raw for _, raw in messages)
+        return
+    with open(largest, "rb", buffering=0) as place:
+        for _, raw in messages:
+            place.seek(min(place.tell() + len(raw), largest.stat().st_size))
+            yield raw
 
 
 def _array_columns(messages: Iterator[_Message]) -> Iterator[tuple[np.ndarray, ...]]:

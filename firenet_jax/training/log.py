@@ -7,9 +7,11 @@ lines that came after it are dropped.
 import contextlib
 import json
 import math
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +21,10 @@ from tensorboardX import SummaryWriter
 
 from firenet_jax.checkpoint import save_weights
 from firenet_jax.devices import is_first
+from firenet_jax.errors import logger
 from firenet_jax.network import Weights
 from firenet_jax.pictures import event_pictures
-from firenet_jax.storage.files import write_text
+from firenet_jax.storage.files import write_text, writing
 
 
 class Log:
@@ -33,12 +36,30 @@ class Log:
     def __init__(self, folder: Path, step: int):
         self.path, self.start = folder / "log.jsonl", time.monotonic()
         self.entries = [entry for entry in _entries(self.path) if entry["step"] <= step]
-        self.board = None
+        self.board: Any = None
+        self.failed: OSError | None = None
         if is_first():
             write_text(self.path, "".join(json.dumps(entry) + "\n" for entry in self.entries))
-            self.board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
+            self.hook, threading.excepthook = threading.excepthook, self._ended
+            self.board = SummaryWriter(  # a queue that holds what `write` and `show` put into it
+                str(folder / "tensorboard"), purge_step=step + 1, max_queue=1000
+            )
+
+    def _ended(self, what: threading.ExceptHookArgs) -> None:
+        """TensorBoard's curves are written by a thread; what ends it is raised by the next call,
+        which would else fill the queue and wait."""
+        if not isinstance(what.exc_value, OSError):
+            self.hook(what)
+        else:
+            self.failed = what.exc_value
+
+    def _check(self) -> None:
+        if self.failed is not None:
+            with writing(self.path.with_name("tensorboard")):
+                raise self.failed
 
     def write(self, step: int, kind: str, values: dict) -> dict[str, float]:
+        self._check()
         values = {name: float(value) for name, value in values.items()}
         entry = {"step": step, "kind": kind, **values, "seconds": time.monotonic() - self.start}
         if self.board is not None:
@@ -73,8 +94,18 @@ class Log:
         return min(filter(math.isfinite, losses), default=math.inf)
 
     def close(self) -> None:
-        if self.board is not None:
-            self.board.close()
+        """Raises nothing, so that it can follow an error."""
+        if self.board is None:
+            return
+        threading.excepthook = self.hook
+        try:
+            if self.failed is None:
+                self.board.close()
+        except OSError as error:
+            self.failed = error
+        if self.failed is not None:
+            logger.warning("TensorBoard's curves are not whole (%s)", self.failed.strerror)
+            self.board.file_writer.event_writer._closed = True  # else it tries again at the exit
 
 
 def _entries(path: Path) -> Iterator[dict]:

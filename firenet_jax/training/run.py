@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -73,7 +74,7 @@ def run(settings: Train, stop: int | None = None) -> None:
         ocp.CheckpointManager((folder / "checkpoints").absolute(), options=options) as saved,
     ):
         if saved.latest_step() is not None:
-            state = saved.restore(saved.latest_step(), args=ocp.args.StandardRestore(state))
+            state = restored(saved, state)
             logger.warning("%s: going on after step %d", folder, state.step)
         done = int(state.step)
         sources, validation = sources_of(settings, done)
@@ -82,6 +83,7 @@ def run(settings: Train, stop: int | None = None) -> None:
         best, last_save = log.best(), time.monotonic()
         last = min(settings.steps, stop or settings.steps)
         with (
+            contextlib.closing(log),
             bar(last, "step", quiet=not is_first(), initial=done) as progress,
             _interruptible() as interrupted,
         ):
@@ -101,11 +103,26 @@ def run(settings: Train, stop: int | None = None) -> None:
                     last_save = time.monotonic()
         if interrupted and saved.latest_step() != done:
             saved.save(done, args=ocp.args.StandardSave(state))
-        log.close()
     if interrupted:
         raise KeyboardInterrupt(f"step {done} is saved: the same command goes on from there")
     if is_first():
         print(f"{folder / 'weights.npz'}: best validation loss {best:.4f} in {done} steps")
+
+
+def restored(saved: ocp.CheckpointManager, state: Any) -> Any:
+    """The newest checkpoint, as a tree of the same shapes as `state`.
+
+    Raises CheckpointError for one that is damaged.
+    """
+    newest = saved.latest_step()
+    try:
+        return saved.restore(newest, args=ocp.args.StandardRestore(state))
+    except Exception as error:  # damaged bytes reach every kind, of orbax, tensorstore and JSON
+        reason = " ".join(str(error).split())[:100]
+        raise CheckpointError(
+            f"{saved.directory / str(newest)} is damaged ({type(error).__name__}: {reason}): "
+            "remove it, and the run goes on after the checkpoint before"
+        ) from error
 
 
 def _judge(
