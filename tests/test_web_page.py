@@ -58,6 +58,10 @@ def test_pictures_in_a_browser_are_those_of_python(tmp_path, capsys):
         )
     page, text = tmp_path / "page", tmp_path / "a.txt"
     write_recording(text, 6000, width=52, height=40)
+    head, *lines = text.read_text().splitlines()
+    words = [line.split() for line in lines]
+    rows = [f"{t} {x} {y} {int(int(x) < 26)}" for t, x, y, _ in words]  # bright, and dark
+    text.write_text("\n".join([head, *rows]) + "\n")
     run(Export(web=page, runtime=Path(runtime), sample=text))
 
     rows = np.loadtxt(text, skiprows=1)
