@@ -8,7 +8,7 @@ FROM python:3.13-slim
 
 COPY dist/firenet_jax-*.whl /tmp/
 # jax within the bounds of the wheel, whose reasons stand in pyproject.toml.
-RUN pip install --no-cache-dir "$(ls /tmp/firenet_jax-*.whl)[formats]" "jax[cuda12]<0.11,!=0.10.2" \
+RUN pip install --no-cache-dir "$(ls -t /tmp/firenet_jax-*.whl | head -1)[formats]" "jax[cuda12]<0.11,!=0.10.2" \
     && rm /tmp/firenet_jax-*.whl
 
 RUN useradd --create-home firenet

@@ -96,7 +96,8 @@ def inputs(folder: Path) -> dict[str, Path]:
     made("a.dat", b"% Version 2\n% Width 24\n% Height 20\n\x00\x08" + words)
     bits = [x, y, p << 7 | t >> 16, t >> 8 & 255, t & 255]
     made("a.bin", np.stack(bits, 1).astype(np.uint8).tobytes())
-    evt3 = np.array([0x8001, 0x6001, 0x0003, 0x2805, 0x3002, 0x4FFF, 0x50FF] * 60, "<u2")
+    words = [0x8001, 0x6001, 0x0003, 0x2805, 0xA101, 0x3002, 0x4FFF, 0x50FF]  # a trigger, too
+    evt3 = np.array(words * 60, "<u2")
     made("a.raw", b"% evt 3.0\n% geometry 1280x720\n% end\n" + evt3.tobytes())
     _newer(made, t.tolist(), x.tolist(), y.tolist(), p.tolist())
     save_weights(folder / "weights.npz", Weights(_params(), True))

@@ -1,6 +1,10 @@
 """Images and pictures in other files, read back by the libraries of these formats."""
 
+import json
+import os
 import sqlite3
+import subprocess
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -92,6 +96,41 @@ def test_bags_are_read_back(tmp_path, name, colours):
     if name.endswith("ros2"):
         inside = {path.name for path in (tmp_path / name).iterdir()}
         assert inside == {"metadata.yaml", "images.ros2.db3"}
+
+
+OF_ROS = """
+import json, sys
+import rosbag
+with rosbag.Bag(sys.argv[1]) as bag:
+    for topic, message, time in bag.read_messages():
+        stamp = [message.header.stamp.to_nsec(), time.to_nsec()]
+        size = [message.height, message.width, message.step]
+        print(json.dumps([topic, message._type, message.header.frame_id, message.encoding, stamp,
+                          size, list(message.data)]))
+"""
+
+
+def test_ros_itself_reads_a_bag(tmp_path):
+    """By its own library, which Debian has for its own Python (python3-rosbag)."""
+    pytest.importorskip("rosbags")
+    python = "/usr/bin/python3"
+    asked = [python, "-c", "import rosbag, sensor_msgs.msg"]
+    if not Path(python).exists() or subprocess.run(asked, capture_output=True).returncode:
+        pytest.skip("needs ROS's own library: Debian's python3-rosbag, python3-sensor-msgs")
+    shown = pictures()
+    write(BagWriter(tmp_path / "images.bag", "/cam7/image_raw", "left"), shown)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [python, "-c", OF_ROS, tmp_path / "images.bag"],
+        env=environment, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    found = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(found) == len(shown)
+    for (*facts, stamps, size, data), time, picture in zip(found, TIMES, shown, strict=True):
+        assert facts == ["/cam7/image_raw", "sensor_msgs/Image", "left", "mono8"]
+        assert stamps == [1000 * time, 1000 * time] and size == [*picture.shape, picture.shape[1]]
+        assert data == picture.ravel().tolist()
 
 
 @pytest.mark.parametrize("name", ["images.bag", "images.ros2"])

@@ -1,27 +1,21 @@
 """The page in a browser: its pictures are those of `firenet reconstruct`."""
 
 import gzip
-import http.server
 import json
 import os
 import shutil
-import signal
-import subprocess
-import threading
 import zipfile
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import BROWSERS, find_browser, in_browser
 from PIL import Image
 from test_cli import firenet
 from test_pipeline import write_recording
 
 from firenet_jax.commands.export import Export, run, simulated
 from firenet_jax.export.web_page import FILES
-
-BROWSERS = "chromium-headless-shell", "chromium", "chromium-browser", "google-chrome"
 
 # Reconstructs each recording, sends its pictures here; then what the page itself says.
 TEST_PAGE = """<!doctype html><iframe id="page" src="index.html"></iframe><script type="module">
@@ -53,48 +47,10 @@ await send("done", "");
 </script>"""
 
 
-class Server(http.server.SimpleHTTPRequestHandler):
-    """Files of a folder; keeps what is posted."""
-
-    def __init__(self, *arguments, posted, done, **options):
-        self.posted, self.done = posted, done
-        super().__init__(*arguments, **options)
-
-    def do_POST(self):
-        self.posted[self.path[1:]] = self.rfile.read(int(self.headers["Content-Length"]))
-        self.send_response(204)
-        self.end_headers()
-        if self.path == "/done":
-            self.done.set()
-
-    def log_message(self, *_):
-        pass
-
-
-def in_browser(folder: Path, browser: str) -> dict[str, bytes]:
-    posted, done = {}, threading.Event()
-    handler = partial(Server, directory=folder, posted=posted, done=done)
-    with http.server.ThreadingHTTPServer(("localhost", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        url = f"http://localhost:{server.server_port}/test.html"
-        # A port for debugging keeps the headless shell open after the page has loaded.
-        options = ["--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0"]
-        command = [browser, *options, f"--user-data-dir={folder}/profile", url]
-        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        process = subprocess.Popen(command, start_new_session=True, **silent)
-        try:
-            assert done.wait(600), f"the page sent {list(posted)} and no more"
-        finally:
-            os.killpg(process.pid, signal.SIGKILL)  # it has children
-            process.wait()
-            server.shutdown()
-    return posted
-
-
 @pytest.mark.slow
 def test_pictures_in_a_browser_are_those_of_python(tmp_path, capsys):
     pytest.importorskip("onnx")
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    browser = find_browser()
     runtime = os.environ.get("FIRENET_ONNXRUNTIME_WEB")
     if browser is None or runtime is None:
         pytest.skip(
@@ -102,6 +58,10 @@ def test_pictures_in_a_browser_are_those_of_python(tmp_path, capsys):
         )
     page, text = tmp_path / "page", tmp_path / "a.txt"
     write_recording(text, 6000, width=52, height=40)
+    head, *lines = text.read_text().splitlines()
+    words = [line.split() for line in lines]
+    rows = [f"{t} {x} {y} {int(int(x) < 26)}" for t, x, y, _ in words]  # bright, and dark
+    text.write_text("\n".join([head, *rows]) + "\n")
     run(Export(web=page, runtime=Path(runtime), sample=text))
 
     rows = np.loadtxt(text, skiprows=1)

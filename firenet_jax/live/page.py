@@ -23,7 +23,7 @@ BOUNDARY = "picture"
 
 PAGE = """<!doctype html>
 <meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>firenet live</title>
+<title>firenet live</title><link rel="icon" href="data:,">
 <style>
  body { background: #111; color: #ccc; font: 16px system-ui; margin: 2em; }
  img { width: 100%; max-width: 80em; image-rendering: pixelated; background: #000; }

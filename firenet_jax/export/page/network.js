@@ -4,9 +4,13 @@ import { BINS, voxels } from "./events.js";
 
 const CHANNELS = 16;
 
-/** Loads runtime and network once. `gpu` false: wasm even where there is a GPU. */
-export async function load(gpu = "gpu" in navigator) {
-  if (gpu && (await navigator.gpu?.requestAdapter().catch(() => null))) {
+/**
+ * Loads runtime and network once. gpu true: any GPU, also one that the processor stands in for,
+ * which is slower than wasm; false: none.
+ */
+export async function load(gpu) {
+  const adapter = gpu !== false && (await navigator.gpu?.requestAdapter().catch(() => null));
+  if (adapter && (gpu || !(adapter.info ?? adapter).isFallbackAdapter)) {
     try {
       return await open("ort.webgpu.min.mjs", "webgpu");
     } catch (error) {
