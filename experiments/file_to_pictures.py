@@ -33,6 +33,7 @@ from firenet_jax.checkpoint import load_weights
 from firenet_jax.commands.jobs import Job, Outcome, Way, in_chunks
 from firenet_jax.commands.reconstruct import Reconstruct, run
 from firenet_jax.events import Events
+from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import events_to_pictures, initial_session
 from firenet_jax.storage.video import PNG_LEVEL, FolderWriter
@@ -41,6 +42,7 @@ from firenet_jax.windows import Windows
 WIDTH, HEIGHT = 240, 180
 COUNT = round(0.35 * WIDTH * HEIGHT)
 WINDOWS = Windows(events=COUNT)
+FIXED = Display(range="fixed")  # as the other side has it
 
 
 def write_text(path: Path, events: int) -> None:
@@ -77,7 +79,7 @@ def by_pytorch(recording: Path, output: Path) -> None:
 
 
 def by_us(recording: Path, output: Path) -> None:
-    run(Reconstruct((recording,), output, windows=WINDOWS))
+    run(Reconstruct((recording,), output, windows=WINDOWS, display=FIXED))
 
 
 def stages(recording: Path, folder: Path) -> dict:
@@ -99,8 +101,9 @@ def stages(recording: Path, folder: Path) -> dict:
         session, pictures = initial_session(1, HEIGHT, WIDTH, Way().network), []
         for chunk in chunks:
             session, shown = events_to_pictures(
-                weights, session, chunk.events, chunk.valid, height=HEIGHT, width=WIDTH
-            )
+                weights, session, chunk.events, chunk.valid, height=HEIGHT, width=WIDTH,
+                settings=FIXED,
+            )  # fmt: skip
             pictures.append(np.asarray(shown)[:, 0])
         return pictures
 

@@ -75,6 +75,7 @@ from firenet_jax.network import (
     multiply_adds,
     step,
 )
+from firenet_jax.pictures import Display
 from firenet_jax.reconstruction import Network, events_to_pictures, initial_session, reconstruct
 from firenet_jax.simulation.scenes import SceneSettings
 from firenet_jax.simulation.sensor import SensorSettings
@@ -93,6 +94,7 @@ BATCHES = (1, 4, 16)
 IN_SCAN = 4  # windows
 IN_CHUNK = 8  # windows of the pipeline
 EVENTS_PER_PIXEL = 0.35
+FIXED = Display(range="fixed")  # what the other side has
 REST = 0.02  # seconds: the threads of PyTorch's OpenMP spin for a few milliseconds after their work
 # The losses and the optimiser that the other side has too.
 LOSS = Loss(l1=1.0, nlpd=0.5, ssim=0.5, haarpsi=0.0, l0=5)
@@ -274,7 +276,9 @@ def pipeline_makers(width: int, height: int) -> Makers:
             session, pictures = initial_session(1, **size, network=Network()), []
             for first in range(0, IN_CHUNK, chunk):
                 packed = pack([[window] for window in windows[first : first + chunk]])
-                session, part = events_to_pictures(weights, session, packed, valid, **size)
+                session, part = events_to_pictures(
+                    weights, session, packed, valid, settings=FIXED, **size
+                )
                 pictures.append(np.asarray(part[:, 0]))
             return np.concatenate(pictures)
 

@@ -138,7 +138,7 @@ def test_stablehlo_runs_where_the_package_is_not_imported(tmp_path):
         np.testing.assert_allclose(found[name], images, atol=1e-6, rtol=0)
         np.testing.assert_allclose(found[f"{name}g1"], state.g1, atol=1e-6, rtol=0)
         np.testing.assert_allclose(found[f"{name}g2"], state.g2, atol=1e-6, rtol=0)
-        _, pictures = fj.display(None, images)
+        _, pictures = fj.display(None, images, settings=Display(range="fixed"))
         assert np.abs(found[f"{name}picture"].astype(int) - pictures[-1]).max() <= 1
 
 

@@ -19,9 +19,10 @@ from jax import export
 
 from firenet_jax.export import missing
 from firenet_jax.network import BINS, CHANNELS, State, Weights
-from firenet_jax.pictures import display
+from firenet_jax.pictures import Display, display
 from firenet_jax.reconstruction import reconstruct
 
+FIXED = Display(range="fixed")  # a range that follows the images would be one more state
 PLATFORMS = "cpu", "cuda", "rocm", "tpu"
 
 
@@ -29,7 +30,8 @@ def stablehlo(weights: Weights, *, normalise: bool = True, picture: bool = False
     """Weights -> the file's bytes.
 
     normalise: raw event tensors are normalised in it, where the weights ask for normalised ones.
-    picture: a result more, (batch, height, width) uint8, as `pictures.display` has it.
+    picture: a result more, (batch, height, width) uint8, as `pictures.display` has it, of a
+        fixed range.
     Raises OutputError where the library flatbuffers is not installed.
     """
     try:
@@ -41,7 +43,7 @@ def stablehlo(weights: Weights, *, normalise: bool = True, picture: bool = False
     def step(events, g1, g2):
         state, images = reconstruct(inside, State(g1, g2), events[None], machine_code=False)
         results = images[0], state.g1, state.g2
-        return (*results, display(None, images)[1][0]) if picture else results
+        return (*results, display(None, images, settings=FIXED)[1][0]) if picture else results
 
     sizes = export.symbolic_shape("batch, height, width")
     shapes = [jax.ShapeDtypeStruct((*sizes, n), jnp.float32) for n in (BINS, CHANNELS, CHANNELS)]
