@@ -1,4 +1,4 @@
-"""What all tests share: strict JAX flags, cheap compilation, compiled programs, the slow switch,
+"""What all tests share: strict JAX flags, compiled programs, the slow switch,
 data outside the repository, and which tests run in one process (`-n 2 --dist loadgroup`).
 """
 
@@ -19,9 +19,6 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     # a processor but a hint to LLVM.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-# Tests compile much and compute little, so XLA optimises little. `.ci/run` repeats those that
-# compare with published numbers with full optimisation, as users have it.
-os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 # PyTorch's and BLAS's threads spin while they wait: with a process on each core they take the time
 # that the others need.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
