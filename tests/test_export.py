@@ -84,7 +84,7 @@ def test_onnx_equals_jax_over_50_steps(size):
     _, pictures = fj.display(fj.initial_display_state(size[0]), images, settings=fixed)
     levels = found["picture"][:, :, 0].astype(int) - np.asarray(pictures, int)
     assert np.abs(levels).max() <= 1 and (levels != 0).mean() < 1e-3
-    assert np.ptp(np.asarray(pictures)) > 100
+    assert np.ptp(np.asarray(pictures)) > 80
 
 
 def test_onnx_without_normalisation_takes_any_weights():
