@@ -1,6 +1,8 @@
 """Methods beside frames: numbers against a direct computation, gaps, resuming, the report."""
 
 import csv
+import datetime
+import html
 import json
 import re
 import shlex
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
+import firenet_jax
 from firenet_jax import cli
 from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.commands import evaluate, options
@@ -202,6 +205,33 @@ def test_the_page_is_well_formed_and_needs_nothing_else(evaluated):
     command = re.search("<code>(.*?)</code>", text)[1]
     assert command == evaluated[1]["command"] and command.startswith("firenet evaluate ")
     assert "histogram equalisation before metrics: none" in text and "data range 1" in text
+
+
+def test_the_page_says_when_by_what_and_what_each_method_is(evaluated):
+    text = html.unescape((evaluated[0] / "index.html").read_text())
+    for said in (
+        f"{datetime.date.today().isoformat()}, firenet_jax {firenet_jax.__version__}; settings: ",
+        "equalise none",
+        "ours: FireNet (Scheerlinck et al. 2020) with the weights of this name",
+        "e2vid-random: E2VID with random weights: its images mean nothing",
+        "hf: high-pass filter (Scheerlinck et al. 2018), not learned",
+        "mr: manifold regularisation (Reinbacher et al. 2016), not learned",
+    ):
+        assert said in text
+    assert text.count("<table>") == 2 + 2  # means over sequences, over frames, each sequence
+
+
+def test_a_single_recording_has_a_single_table(folder, tmp_path, capsys):
+    run(settings(folder, tmp_path / "out", data=(folder / "data" / "a.h5",), methods="hf"))
+    text = (tmp_path / "out" / "index.html").read_text()
+    assert text.count("<table>") == 1
+    assert "mean over" not in capsys.readouterr().out
+
+
+def test_methods_without_weights_only_where_asked_for(folder, tmp_path):
+    assert Evaluate((folder,), tmp_path).method_names == ["firenet", "hf", "mr"]
+    random = Evaluate((folder,), tmp_path, e2vid_random=True)
+    assert random.method_names == ["firenet", "e2vid", "hf", "mr"]
 
 
 def test_the_pages_events_are_those_before_its_frames(folder, evaluated):
