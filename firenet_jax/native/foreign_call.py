@@ -40,7 +40,7 @@ USERS, IMAGES, WORKERS, ARRAYS, COUNTERS, COUNTER = 0, 8, 16, 24, 128, 64
 
 # Memory that the stages of a call share is kept for the next call, of whatever function: to have
 # new pages from the system takes as long as a good part of the work. One block, its size before it.
-LINE, MOST_KEPT = 64, 2**28
+LINE, MOST_KEPT = 64, 2**31
 _kept = ctypes.c_int64(0)
 
 
