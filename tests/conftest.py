@@ -28,9 +28,27 @@ import pytest  # noqa: E402
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
+# XLA compiles for most of the time that these take, for programs that run once on little data.
+# Here it does so with few optimisations, but for tests that are marked `optimised`; commands that
+# tests start as processes of their own are compiled as a user's are.
+COMPILED_QUICKLY = (
+    "test_batches.py", "test_checkpoint.py", "test_choice.py", "test_colour.py",
+    "test_dataset.py", "test_demo.py", "test_e2vid.py", "test_losses.py", "test_native.py",
+    "test_network.py", "test_pipeline.py", "test_reconstruct_at.py", "test_reconstruction.py",
+    "test_scenes.py", "test_sensor.py", "test_trial.py",
+)  # fmt: skip
+
 # With `-n 2 --dist loadgroup` a file's tests share data and run in one process, but each of these
 # may run in another; pytest-xdist begins with the files of many tests, so they fill what is left.
 APART = ("test_experiments.py", "test_no_room.py")
+
+
+@pytest.hookimpl(tryfirst=True)  # before fixtures, which compile too
+def pytest_runtest_setup(item):
+    quickly = item.path.name in COMPILED_QUICKLY and "optimised" not in item.keywords
+    if quickly != jax.config.read("jax_disable_most_optimizations"):
+        jax.config.update("jax_disable_most_optimizations", quickly)
+        jax.clear_caches()  # programs that are compiled already do not know of the setting
 
 
 def pytest_unconfigure():

@@ -145,11 +145,15 @@ def test_what_no_event_tells_of_teaches_brightness_alone(tmp_path):
     images = rng.random((3, 1, 32, 32)).astype(np.float32)
     params = initial_params(jax.random.key(0))
 
-    def gradient(images):
+    @jax.jit
+    def of_images(images):
         still = jnp.zeros((3, 1, 32, 32, 2)), jnp.zeros((3, 1, 32, 32), bool)
-        data = Simulation(jnp.asarray(tensors), jnp.asarray(images), *still)
-        grad = jax.grad(lambda p: loss_of(p, data, None, False, settings)[0])(params)
-        return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(grad)])
+        data = Simulation(jnp.asarray(tensors), images, *still)
+        return jax.grad(lambda p: loss_of(p, data, None, False, settings)[0])(params)
+
+    def gradient(images):
+        leaves = jax.tree.leaves(of_images(images.astype(np.float32)))
+        return np.concatenate([np.ravel(leaf) for leaf in leaves])
 
     far, close = images.copy(), images.copy()
     far[..., 12:, :] = far[..., 12:, ::-1]

@@ -447,6 +447,7 @@ def windows_of(events, bounds):
     return [events.select(slice(*cut)) for cut in zip(cuts[:-1], cuts[1:], strict=True)]
 
 
+@pytest.mark.optimised
 def test_event_lists_give_the_tensors_of_the_device(simulated, scenes):
     """Same seed, two ways. What differs is the rounding of the picture itself: the compiler fuses
     its coordinates differently, by 1e-5 pixels, and that can move a stamp by a microsecond."""
@@ -480,6 +481,7 @@ def test_no_more_than_half_a_pixel_between_two_renderings(simulated):
     assert 0.5 < length.max() <= 0.5 * RENDERINGS
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize("simulated", ["faulty"], indirect=True)
 def test_simulation_goes_on_where_it_ended(simulated, scenes):
     bounds, parts = simulated.bounds, []
@@ -612,8 +614,8 @@ def test_a_clean_sensor_among_faulty_ones_is_the_papers(textures):
     settings = replace(FAULTY, threshold_range=(0.3, 0.6), clean=0.5)
     make = partial(module.random_sensor, height=8, width=9)
     keys = jax.random.split(jax.random.key(0), 200)
-    sensors = jax.vmap(partial(make, settings=settings))(keys)
-    faulty = jax.vmap(partial(make, settings=replace(settings, clean=0.0)))(keys)
+    sensors = jax.jit(jax.vmap(partial(make, settings=settings)))(keys)
+    faulty = jax.jit(jax.vmap(partial(make, settings=replace(settings, clean=0.0))))(keys)
     clean = np.asarray(sensors.noise[:, 0]) == 0
     assert 0.4 < clean.mean() < 0.6
     for name in ("on", "off", "refractory", "drift", "noise", "cutoff"):
