@@ -393,15 +393,6 @@ CLEAR = replace(
     scene=replace(BROAD.scene, halt=0.45),
     sensor=replace(BROAD.sensor, clean=0.35),
 )
-# Flicker counts: until here its term was a fiftieth of the loss, and on clean sensors that was where
-# the published weights were ahead.
-STEADY = replace(
-    CLEAR,
-    steps=1200,
-    learning_rate=8e-4,
-    seed=171,
-    loss=replace(CLEAR.loss, lambda_tc=30.0),
-)
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
@@ -427,7 +418,6 @@ STAGES = {
     "dense": (DENSE, None),
     "broad": (BROAD, None),
     "clear": (CLEAR, None),
-    "steady": (STEADY, None),
 }
 # Parts of a mean: what a stage starts from, if not from the one before.
 FIRST = {"even": 1, "usual": 1, "settle": 1, "natural": 9}
@@ -442,7 +432,6 @@ MEANS = {
     "detail": BEFORE | {"still": 40},
     "ages": BEFORE | {"detail": 36, "still": 14},
     "clear": {"dense": 1, "broad": 1},
-    "steady": {"dense": 1, "broad": 1, "clear": 2},
 }
 # What is built in: the last stage keeps what was seen, in noise too, and cost SSIM on faulty
 # sensors; the mean with what it began from has most of both.
