@@ -45,7 +45,7 @@ def is_machine_code(function, *arguments):
     return "custom_call" in jax.jit(function).lower(*arguments).as_text()
 
 
-def test_machine_code_is_for_cpus_where_it_is():
+def test_machine_code_is_for_cpus_where_it_is(afresh):
     def quick(x):
         return -x
 

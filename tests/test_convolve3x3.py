@@ -18,6 +18,12 @@ pytestmark = pytest.mark.skipif(
     reason="no machine code for this processor",
 )
 
+
+@pytest.fixture(autouse=True)
+def _switched_on(monkeypatch):
+    monkeypatch.delenv("FIRENET_NATIVE", raising=False)
+
+
 # B, H, W, inputs, outputs: less than a tile and a register, one more than that, training's.
 SHAPES = [
     (1, 1, 1, 1, 16),
