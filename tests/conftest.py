@@ -32,10 +32,11 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # Here it does so with few optimisations, but for tests that are marked `optimised`; commands that
 # tests start as processes of their own are compiled as a user's are.
 COMPILED_QUICKLY = (
-    "test_batches.py", "test_checkpoint.py", "test_choice.py", "test_colour.py",
-    "test_dataset.py", "test_demo.py", "test_e2vid.py", "test_losses.py", "test_native.py",
-    "test_network.py", "test_pipeline.py", "test_reconstruct_at.py", "test_reconstruction.py",
-    "test_scenes.py", "test_sensor.py", "test_trial.py",
+    "test_batches.py", "test_blocks.py", "test_checkpoint.py", "test_choice.py", "test_colour.py",
+    "test_dataset.py", "test_demo.py", "test_e2vid.py", "test_export.py", "test_losses.py",
+    "test_lpips.py", "test_metrics.py", "test_native.py", "test_network.py", "test_pipeline.py",
+    "test_reconstruct_at.py", "test_reconstruction.py", "test_scenes.py", "test_sensor.py",
+    "test_train.py", "test_trial.py",
 )  # fmt: skip
 
 # With `-n 2 --dist loadgroup` a file's tests share data and run in one process, but each of these

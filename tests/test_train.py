@@ -198,6 +198,8 @@ def test_nothing_that_a_compiled_step_depends_on_is_a_path(tmp_path):
     assert not any(isinstance(leaf, Path) for leaf in leaves(tiny(tmp_path).step_settings))
 
 
+@pytest.mark.slow
+@pytest.mark.optimised
 def test_sequences_of_a_batch_are_of_different_ages_and_go_on_where_they_were(tmp_path):
     asked = tiny(tmp_path, chain=4, sensor=replace(FAULTY, mid_recording=True))
     settings = asked.step_settings
@@ -235,9 +237,10 @@ def test_remat_and_bfloat16_change_little(tmp_path):
     tensors = jax.random.normal(jax.random.key(1), (3, 1, 16, 16, 5))
 
     def gradient(settings):
-        return jax.grad(
-            lambda params: (images_of(params, tensors, settings.step_settings)[1] ** 2).sum()
-        )(params)
+        def energy(params):
+            return (images_of(params, tensors, settings.step_settings)[1] ** 2).sum()
+
+        return jax.jit(jax.grad(energy))(params)
 
     exact, again = gradient(settings), gradient(replace(settings, remat=True))
     rough = gradient(replace(settings, bfloat16=True))
