@@ -35,7 +35,7 @@ COMPILED_QUICKLY = (
     "test_batches.py", "test_blocks.py", "test_checkpoint.py", "test_choice.py", "test_colour.py",
     "test_dataset.py", "test_demo.py", "test_e2vid.py", "test_export.py", "test_losses.py",
     "test_lpips.py", "test_metrics.py", "test_native.py", "test_network.py", "test_pipeline.py",
-    "test_reconstruct_at.py", "test_reconstruction.py", "test_scenes.py", "test_sensor.py",
+    "test_reconstruct_at.py", "test_reconstruction.py", "test_scenes.py",
     "test_train.py", "test_trial.py",
 )  # fmt: skip
 

@@ -447,7 +447,6 @@ def windows_of(events, bounds):
     return [events.select(slice(*cut)) for cut in zip(cuts[:-1], cuts[1:], strict=True)]
 
 
-@pytest.mark.optimised
 def test_event_lists_give_the_tensors_of_the_device(simulated, scenes):
     """Same seed, two ways. What differs is the rounding of the picture itself: the compiler fuses
     its coordinates differently, by 1e-5 pixels, and that can move a stamp by a microsecond."""
@@ -481,7 +480,6 @@ def test_no_more_than_half_a_pixel_between_two_renderings(simulated):
     assert 0.5 < length.max() <= 0.5 * RENDERINGS
 
 
-@pytest.mark.optimised
 @pytest.mark.parametrize("simulated", ["faulty"], indirect=True)
 def test_simulation_goes_on_where_it_ended(simulated, scenes):
     bounds, parts = simulated.bounds, []
