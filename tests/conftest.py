@@ -29,14 +29,14 @@ import pytest  # noqa: E402
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # XLA compiles for most of the time that these take, for programs that run once on little data.
-# Here it does so with few optimisations, but for tests that are marked `optimised`; commands that
-# tests start as processes of their own are compiled as a user's are.
+# Here it does so with few optimisations, but for tests that are marked `optimised`. Processes that
+# tests start are compiled as a user's are, but for those with `processes.COMPILES_SOON`.
 COMPILED_QUICKLY = (
     "test_batches.py", "test_blocks.py", "test_checkpoint.py", "test_choice.py", "test_colour.py",
     "test_dataset.py", "test_demo.py", "test_e2vid.py", "test_export.py", "test_losses.py",
     "test_lpips.py", "test_metrics.py", "test_native.py", "test_network.py", "test_pipeline.py",
-    "test_reconstruct_at.py", "test_reconstruction.py", "test_scenes.py",
-    "test_train.py", "test_trial.py",
+    "test_reconstruct_at.py", "test_reconstruction.py", "test_scenes.py", "test_train.py",
+    "test_trial.py",
 )  # fmt: skip
 
 # With `-n 2 --dist loadgroup` a file's tests share data and run in one process, but each of these
