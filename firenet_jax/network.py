@@ -170,8 +170,8 @@ def initial_params(key: jax.Array):
     With PyTorch's default, which the original uses, a signal fades to a tenth on its way to the
     image, and half of the last layers died in the first steps of training.
     """
-    tensor = jnp.zeros((1, 8, 8, BINS))
-    return FireNet().init(key, initial_state(1, 8, 8), tensor)["params"]
+    state, tensor = jax.eval_shape(lambda: (initial_state(1, 8, 8), jnp.zeros((1, 8, 8, BINS))))
+    return FireNet().lazy_init(key, state, tensor)["params"]  # without computing an image
 
 
 def multiply_adds(height: int, width: int) -> int:

@@ -1,5 +1,5 @@
 """What all tests share: strict JAX flags, compiled programs, the slow switch,
-data outside the repository, and which tests run in one process (`-n 2 --dist loadgroup`).
+data outside the repository, and which tests run in one process (`-n 2`).
 """
 
 import os
@@ -34,14 +34,26 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 COMPILED_QUICKLY = (
     "test_batches.py", "test_blocks.py", "test_checkpoint.py", "test_choice.py", "test_colour.py",
     "test_dataset.py", "test_demo.py", "test_e2vid.py", "test_export.py", "test_losses.py",
-    "test_lpips.py", "test_metrics.py", "test_native.py", "test_network.py", "test_pipeline.py",
-    "test_reconstruct_at.py", "test_reconstruction.py", "test_scenes.py", "test_train.py",
-    "test_trial.py",
+    "test_lpips.py", "test_metrics.py", "test_native.py", "test_network.py", "test_notebooks.py",
+    "test_pipeline.py", "test_reconstruct_at.py", "test_reconstruction.py", "test_scenes.py",
+    "test_sensor.py", "test_snippets.py", "test_train.py", "test_trial.py",
 )  # fmt: skip
 
-# With `-n 2 --dist loadgroup` a file's tests share data and run in one process, but each of these
-# may run in another; pytest-xdist begins with the files of many tests, so they fill what is left.
+# With `-n 2` a file's tests share data and programs in one process, but each of these may run in
+# another; pytest-xdist begins with the files of many tests, so they fill what is left.
 APART = ("test_experiments.py", "test_no_room.py")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            file = nodeid.partition("::")[0]
+            return nodeid if file.endswith(APART) else file
+
+    return ByFile(config, log)
 
 
 @pytest.hookimpl(tryfirst=True)  # before fixtures, which compile too
@@ -61,12 +73,8 @@ def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="run the slow tests too")
 
 
-@pytest.hookimpl(tryfirst=True)  # pytest-xdist asks for the groups in the same hook
 def pytest_collection_modifyitems(config, items):
     for item in items:
-        if config.pluginmanager.hasplugin("xdist"):
-            group = item.nodeid if item.path.name in APART else item.path.name
-            item.add_marker(pytest.mark.xdist_group(group))
         if "slow" in item.keywords and not config.getoption("--slow"):
             item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
 

@@ -447,6 +447,7 @@ def windows_of(events, bounds):
     return [events.select(slice(*cut)) for cut in zip(cuts[:-1], cuts[1:], strict=True)]
 
 
+@pytest.mark.optimised
 def test_event_lists_give_the_tensors_of_the_device(simulated, scenes):
     """Same seed, two ways. What differs is the rounding of the picture itself: the compiler fuses
     its coordinates differently, by 1e-5 pixels, and that can move a stamp by a microsecond."""
@@ -468,6 +469,7 @@ def test_event_lists_give_the_tensors_of_the_device(simulated, scenes):
     assert np.mean(same) >= 0.999
 
 
+@pytest.mark.optimised
 def test_truth_belongs_to_the_windows_end(simulated, scenes):
     for b in range(B):
         frames = video(of_sequence(scenes, b), np.asarray(simulated.bounds[1:, b]), **SQUARE)
@@ -475,11 +477,13 @@ def test_truth_belongs_to_the_windows_end(simulated, scenes):
         np.testing.assert_allclose(images, simulated.simulation.images[:, b], atol=1e-4)
 
 
+@pytest.mark.optimised
 def test_no_more_than_half_a_pixel_between_two_renderings(simulated):
     length = np.linalg.norm(simulated.simulation.displacement, axis=-1)
     assert 0.5 < length.max() <= 0.5 * RENDERINGS
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize("simulated", ["faulty"], indirect=True)
 def test_simulation_goes_on_where_it_ended(simulated, scenes):
     bounds, parts = simulated.bounds, []
@@ -494,6 +498,7 @@ def test_simulation_goes_on_where_it_ended(simulated, scenes):
     assert (error <= 1e-4).mean() >= 0.999
 
 
+@pytest.mark.optimised
 def test_denser_renderings_give_the_same_events(scenes):
     """Half a pixel between renderings is dense enough: four times denser changes few events."""
     counts = []
@@ -545,8 +550,12 @@ def test_random_sequences_have_the_declared_shapes_and_do_not_retrace(textures):
 
 def test_rare_sequences_are_slow_and_calm_or_swift_before_a_blank_ground(textures):
     settings = SETTINGS | {"batch": 96, "sensor": replace(FAULTY, noise=(1.0, 1.0))}
-    make = partial(module.random_setups, jax.random.key(3), textures, **settings)
-    sensors, scenes, durations = make(slow=0.3, swift=0.2)
+    make = partial(module.random_setups, **settings)
+
+    def made(**shares):
+        return jax.jit(partial(make, **shares))(jax.random.key(3), textures)
+
+    sensors, scenes, durations = made(slow=0.3, swift=0.2)
     pixels = np.asarray(1e-6 * durations * scenes.speed)
     slow, swift = pixels < 0.31, pixels > 15.9
     assert 0.15 < slow.mean() < 0.45 and 0.08 < swift.mean() < 0.32
@@ -557,7 +566,7 @@ def test_rare_sequences_are_slow_and_calm_or_swift_before_a_blank_ground(texture
     np.testing.assert_array_equal(blank, swift)
     calm = np.asarray(sensors.noise[:, 0]) < 0.5
     assert not calm[~slow].any() and 0.4 < calm[slow].mean() < 0.9
-    even, _, _ = make(slow=1e-9, swift=0.2)
+    even, _, _ = made(slow=1e-9, swift=0.2)
     for name in ("on", "off"):
         thresholds, before = (np.asarray(getattr(sensor, name)) for sensor in (sensors, even))
         spread, mean = before.std((1, 2)), before.mean((1, 2), keepdims=True)
@@ -566,13 +575,14 @@ def test_rare_sequences_are_slow_and_calm_or_swift_before_a_blank_ground(texture
         np.testing.assert_allclose(thresholds[slow], farther[slow], rtol=1e-4)
         assert (0.02 < spread).all() and (spread < 0.04).all()
     with pytest.raises(ValueError, match="together less than 1"):
-        make(slow=0.6, swift=0.4)
+        made(slow=0.6, swift=0.4)
 
 
 def test_half_of_the_sequences_that_stop_for_good_are_noisy_in_any_light(textures):
     scene = replace(SETTINGS["scene"], halt=0.5)
     settings = SETTINGS | {"batch": 200, "scene": scene}
-    sensors, scenes, durations = module.random_setups(jax.random.key(4), textures, **settings)
+    make = jax.jit(partial(module.random_setups, **settings))
+    sensors, scenes, durations = make(jax.random.key(4), textures)
     seconds = 1e-6 * np.asarray(durations)
     stopped = np.diff(scenes.pauses[:, 0, :2])[:, 0] > T * seconds
     rate, light, drawn = np.asarray(sensors.noise).T

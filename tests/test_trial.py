@@ -212,7 +212,7 @@ trial.assert_equal(found, trial.steps(False)(weights, state, tensors, valid))
 
 
 def run_alone(script, **environment):
-    environment = {"FIRENET_NATIVE": "1"} | environment
+    environment = {"FIRENET_NATIVE": "1", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"} | environment
     path = [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, path))} | environment
     subprocess.run([sys.executable, "-c", EQUAL + script], env=environment, check=True)
