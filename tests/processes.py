@@ -7,14 +7,18 @@ import subprocess
 import sys
 
 # For what does not depend on how well XLA optimises: it compiles in a third of the time.
-COMPILES_SOON = "--xla_backend_optimization_level=0"
+COMPILED_QUICKLY = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
 
 
-def start(script, *arguments, devices=1, flags=""):
-    environment = os.environ | {
-        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices} {flags}",
-        "JAX_PLATFORMS": "cpu",
-    }
+def start(script, *arguments, devices=1, **more):
+    environment = (
+        os.environ
+        | more
+        | {
+            "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+            "JAX_PLATFORMS": "cpu",
+        }
+    )
     command = [sys.executable, "-c", script, *map(str, arguments)]
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
 
@@ -31,13 +35,13 @@ def finish(*processes):
             process.communicate()
 
 
-def together(script, *arguments, processes=2, flags=""):
+def together(script, *arguments, processes=2, **more):
     """The same script in several processes, told coordinator, how many and which one it is."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
     where = address, processes
-    finish(*(start(script, *arguments, *where, n, flags=flags) for n in range(processes)))
+    finish(*(start(script, *arguments, *where, n, **more) for n in range(processes)))
 
 
 # The libraries are imported before the limit is set: they write files of their own.
@@ -91,9 +95,8 @@ def with_little_room(folder, *lines, disk=None):
         command,
         cwd=folder, capture_output=True, text=True, timeout=900,
         # The limit would hold for the files of compiled programs that tests share, too.
-        env=os.environ | {
-            "XLA_FLAGS": COMPILES_SOON, "JAX_PLATFORMS": "cpu",
-            "JAX_ENABLE_COMPILATION_CACHE": "false",
+        env=os.environ | COMPILED_QUICKLY | {
+            "JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false",
         },
     )  # fmt: skip
     assert ran.returncode == 0, ran.stderr[-2000:]

@@ -40,7 +40,7 @@ def make_inputs(folder):
 
 
 SIMULATE = "--sequences 1 --validation 0 --seconds 0.2 --sensor-size 64x48"
-TRAIN = "--steps 4 --warmup 1 --batch 1 --crop 32 --windows 11 --textures 4"
+TRAIN = "--steps 4 --warmup 1 --batch 1 --crop 32 --windows 11 --textures 4 --haarpsi 0 --nlpd 0"
 TRIALS = {
     "demo": [
         ("-o out.mp4 --seconds 0.4 --sensor-size 64x48", 2_000, "out.mp4"),
