@@ -3,6 +3,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from types import SimpleNamespace
 
 import jax
@@ -181,6 +182,15 @@ def test_a_list_of_several_blocks_is_the_sum_of_its_parts():
     expected = sum(tensor_of(part, bounds=bounds) for part in parts)
     np.testing.assert_allclose(tensor_of(events), expected, atol=0.05)
     assert np.abs(expected).max() > 20
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="elsewhere a list is one block")
+def test_a_list_is_summed_block_by_block():
+    """For speed alone: the sums are the same."""
+    events = random_events(np.random.default_rng(11), 10)
+    for size, blocks in ((4 * BLOCK, 4), (BLOCK, 1), (CAPACITIES[0], 1)):
+        program = jax.make_jaxpr(partial(voxelise, height=12, width=17))(pack([[events]], size))
+        assert f" length={blocks} " in str(program).replace("\n", " "), (size, blocks)
 
 
 def test_a_long_list_is_not_given_away_before_its_times_are_there(monkeypatch):
