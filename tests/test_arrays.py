@@ -105,3 +105,5 @@ def test_what_is_passed_for_weights_and_state_is_told_apart():
 def test_version_and_a_short_repr_of_weights():
     assert fj.__version__.count(".") >= 2
     assert repr(fj.load_weights()) == "Weights(37,777 parameters, normalise=True)"
+    numbers = fj.Weights({"kernel": 1.0, "bias": 2.0}, normalise=False)
+    assert repr(numbers) == "Weights(2 parameters, normalise=False)"

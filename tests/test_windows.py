@@ -116,6 +116,17 @@ def test_a_time_far_from_the_others_is_named_not_reached_window_by_window(window
         list(found)
 
 
+@pytest.mark.parametrize("gap, refused", [(3_600_000_000, False), (3_600_000_001, True)])
+def test_an_hour_without_events_is_no_broken_time(gap, refused):
+    found = cut(recording_of([0, 10_000 + gap]), Windows(duration=10))
+    assert len(next(found).events) == 1
+    if refused:
+        with pytest.raises(RecordingError, match="more than an hour"):
+            next(found)
+    else:
+        assert len(next(found).events) == 0
+
+
 @pytest.mark.parametrize("frames, events", [((0, 100), 10**16), ((10**16, 10**16 + 100), 0)])
 def test_frames_on_another_clock_are_refused(frames, events):
     recording = recording_of(events + np.arange(20), frames=frames)
