@@ -41,6 +41,7 @@ EQUIVALENT = {  # (module, line after the change): why nothing changes
         "windows.py",
         "def _window(events: Events, start: int, stop: int, end: int = 1) -> Window:",
     ): "who leaves `end` out has events, whose last time is taken",
+    ("reconstruction.py", "chunk: int = 9,"): "how many windows at a time is speed alone",
     (
         "windows.py",
         'f"{density:,.0f}" if density > 100 else f"{density:.3g}", round(0.35 * pixels),',

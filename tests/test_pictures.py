@@ -1,3 +1,5 @@
+import math
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -88,6 +90,20 @@ def test_range_survives_chunks_and_ignores_what_is_not_valid(kind):
         parts.append(shown[: len(part)])
     np.testing.assert_array_equal(np.concatenate(parts), expected)
     np.testing.assert_array_equal(state.high, whole.high)
+
+
+def test_bilateral_filter_equals_the_loop_over_neighbours():
+    rng, sigma = np.random.default_rng(4), 1.5
+    image = 0.5 + rng.normal(0, 0.004, (6, 7))
+    padded, expected = np.pad(image, 2, mode="reflect"), np.zeros((6, 7))
+    for y, x in np.ndindex(6, 7):
+        around = [(i, j) for i in range(-2, 3) for j in range(-2, 3) if math.hypot(i, j) <= 2]
+        values = np.array([padded[y + 2 + i, x + 2 + j] for i, j in around])
+        squares = [math.hypot(i, j) ** 2 for i, j in around] + (255 * (values - image[y, x])) ** 2
+        weights = np.exp(-squares / (2 * sigma**2))
+        expected[y, x] = (weights * values).sum() / weights.sum()
+    found = bilateral(jnp.asarray(image, jnp.float32), sigma)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_smoothed_pictures_keep_their_edges():

@@ -194,18 +194,20 @@ def test_the_pictures_network_runs_as_it_is_told():
     assert rough.any() and rough.mean() < 3
 
 
-def test_pictures_are_cut_out_of_the_reflected_ones():
-    """19x23 pixels become 32x32: 7 above and 6 below, 5 on the left and 4 on the right."""
+@pytest.mark.parametrize("pad, above, below, left, right", [(16, 7, 6, 5, 4), (2, 1, 0, 1, 0)])
+def test_pictures_are_cut_out_of_the_reflected_ones(pad, above, below, left, right):
+    """19x23 pixels become 32x32, and 20x24."""
     weights = Weights(initial_params(jax.random.key(0)), True)
     packed = pack([[random_events(np.random.default_rng(2), 300, 19, 23)]])
-    network, valid = Network(pad=16), np.ones((1, 1), bool)
+    network, valid = Network(pad=pad), np.ones((1, 1), bool)
     session = initial_session(1, 19, 23, network)
     _, found = events_to_pictures(
         weights, session, packed, valid, height=19, width=23, network=network
     )
     tensors = np.asarray(normalised(voxelise(packed, height=19, width=23)))
-    padded = np.pad(tensors, ((0, 0), (0, 0), (7, 6), (5, 4), (0, 0)), "reflect")
+    padded = np.pad(tensors, ((0, 0), (0, 0), (above, below), (left, right), (0, 0)), "reflect")
     raw = Weights(weights.params, normalise=False)
-    images = reconstruct(raw, initial_state(1, 32, 32), jnp.asarray(padded))[1]
-    expected = np.asarray(display(initial_display_state(1), images)[1])[..., 7:-6, 5:-4]
+    images = reconstruct(raw, initial_state(1, *padded.shape[2:4]), jnp.asarray(padded))[1]
+    whole = np.asarray(display(initial_display_state(1), images)[1])
+    expected = whole[..., above : above + 19, left : left + 23]
     assert np.abs(np.asarray(found, int) - expected).max() <= 1

@@ -578,6 +578,15 @@ def test_rare_sequences_are_slow_and_calm_or_swift_before_a_blank_ground(texture
         made(slow=0.6, swift=0.4)
 
 
+def test_no_window_is_so_short_that_more_than_a_pixel_passes_between_renderings(textures):
+    """The shortest is a millisecond, in which the fastest would move by a hundred pixels."""
+    scene = replace(SETTINGS["scene"], speed=(1e5, 1e5))
+    make = jax.jit(partial(module.random_setups, **(SETTINGS | {"batch": 4, "scene": scene})))
+    _, scenes, durations = make(jax.random.key(5), textures)
+    assert (np.asarray(durations) == 1000).all()
+    np.testing.assert_allclose((1e-6 * durations * scenes.speed).max(), RENDERINGS, rtol=1e-5)
+
+
 def test_half_of_the_sequences_that_stop_for_good_are_noisy_in_any_light(textures):
     scene = replace(SETTINGS["scene"], halt=0.5)
     settings = SETTINGS | {"batch": 200, "scene": scene}

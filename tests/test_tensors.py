@@ -193,6 +193,12 @@ def test_a_list_is_summed_block_by_block():
         assert f" length={blocks} " in str(program).replace("\n", " "), (size, blocks)
 
 
+def test_lists_are_aligned():
+    """XLA copies what is not."""
+    packed = pack([[random_events(np.random.default_rng(12), 10)]])
+    assert [column.ctypes.data % 64 for column in packed[:5]] == [0] * 5
+
+
 def test_a_long_list_is_not_given_away_before_its_times_are_there(monkeypatch):
     """Another thread copies them, here a slow one."""
     pool, events = ThreadPoolExecutor(1), random_events(np.random.default_rng(9), 1000)
