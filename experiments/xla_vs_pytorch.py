@@ -13,7 +13,8 @@ PyTorch runs as the field's programs do (eager, NCHW, separate gates) and as it 
 gates, channels_last, torch.compile, frozen TorchScript, bfloat16, and CUDA graphs on a GPU. A
 step outside of a scan is PyTorch's only kind. Before anything is timed the float32 results are
 asserted to be equal: images to 1e-4, pictures to a level, loss and gradient to 1e-4 of them.
-float32 is float32 on a GPU too: TF32 is off on both sides.
+float32 is float32 on a GPU too: TF32 is off on both sides. On Linux both sides get what `firenet`
+gives its own commands: huge pages, and in training malloc keeps what is freed.
 
     python experiments/xla_vs_pytorch.py            an hour on two cores; needs torch
     python experiments/xla_vs_pytorch.py --parts training               measures one part again
@@ -66,6 +67,7 @@ from pytorch_firenet import (
     voxelise_original,
 )
 
+from firenet_jax.cli import HUGE_PAGES, KEEP_FREED_MEMORY, set_malloc
 from firenet_jax.events import Events
 from firenet_jax.native import by_xla_alone
 from firenet_jax.network import (
@@ -554,6 +556,7 @@ def measure_pipeline(options) -> dict:
 
 
 def measure_training(options) -> dict:
+    set_malloc(KEEP_FREED_MEMORY)
     sizes = [(crop, batch) for crop in (96, 128) for batch in (2, 4)]
     cases = []
     for crop, batch in chosen(sizes, options):
@@ -687,6 +690,9 @@ def main():
     options = parser.parse_args()
     if options.avx2 and not IS_AVX2:
         os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | AVX2)
+    if sys.platform == "linux" and "GLIBC_TUNABLES" not in os.environ:  # read as a program starts
+        environment = os.environ | {"GLIBC_TUNABLES": HUGE_PAGES}
+        os.execve(sys.executable, [sys.executable, *sys.argv], environment)
     if ONE_THREAD and (threads := torch.get_num_threads()) > 1:
         parser.error(f"{threads} threads: start it as taskset -c 0 python ...")
     if DEVICE == "cuda":
@@ -706,6 +712,7 @@ def main():
         "torch threads": torch.get_num_threads(),
         "torch instructions": torch.backends.cpu.get_cpu_capability(),
         "compiler": COMPILER,
+        "malloc": os.environ.get("GLIBC_TUNABLES"),
         "runs": options.runs,
     }
     name = on_this_device("xla_vs_pytorch") + "_avx2" * IS_AVX2 + "_one_thread" * ONE_THREAD
