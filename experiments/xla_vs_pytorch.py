@@ -67,7 +67,7 @@ from pytorch_firenet import (
     voxelise_original,
 )
 
-from firenet_jax.cli import HUGE_PAGES, KEEP_FREED_MEMORY, set_malloc
+from firenet_jax.cli import HUGE_PAGES
 from firenet_jax.events import Events
 from firenet_jax.native import by_xla_alone
 from firenet_jax.network import (
@@ -103,6 +103,10 @@ LOSS = Loss(l1=1.0, nlpd=0.5, ssim=0.5, haarpsi=0.0, l0=5)
 TRAIN = Train(output=Path("unused"), windows=10, batch=2, crop=96, loss=LOSS, optimiser="adam")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 COMPILER = shutil.which(os.environ.get("CXX", "g++"))
+
+# As `firenet train` has it (`cli.KEEP_FREED_MEMORY`), from the start, before there are threads.
+KEPT = "arena_max=1", "mmap_max=0", f"trim_threshold={2**31 - 1}"
+MALLOC = {"training": ":".join([HUGE_PAGES, *(f"glibc.malloc.{one}" for one in KEPT)])}
 
 NCHW, NHWC = torch.contiguous_format, torch.channels_last
 # Read when JAX and PyTorch are imported: what keeps each from instructions of AVX-512.
@@ -556,7 +560,6 @@ def measure_pipeline(options) -> dict:
 
 
 def measure_training(options) -> dict:
-    set_malloc(KEEP_FREED_MEMORY)
     sizes = [(crop, batch) for crop in (96, 128) for batch in (2, 4)]
     cases = []
     for crop, batch in chosen(sizes, options):
@@ -690,9 +693,12 @@ def main():
     options = parser.parse_args()
     if options.avx2 and not IS_AVX2:
         os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | AVX2)
-    if sys.platform == "linux" and "GLIBC_TUNABLES" not in os.environ:  # read as a program starts
-        environment = os.environ | {"GLIBC_TUNABLES": HUGE_PAGES}
-        os.execve(sys.executable, [sys.executable, *sys.argv], environment)
+    if "GLIBC_TUNABLES" not in os.environ:  # read as a program starts: a process for each part
+        for part in options.parts.split(","):
+            environment = os.environ | {"GLIBC_TUNABLES": MALLOC.get(part, HUGE_PAGES)}
+            command = [sys.executable, *sys.argv, "--parts", part]
+            subprocess.run(command, env=environment, check=True)
+        return
     if ONE_THREAD and (threads := torch.get_num_threads()) > 1:
         parser.error(f"{threads} threads: start it as taskset -c 0 python ...")
     if DEVICE == "cuda":

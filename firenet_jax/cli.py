@@ -103,7 +103,7 @@ REPORT = (
 )
 
 
-def set_malloc(choices: tuple[tuple[int, int], ...]) -> None:
+def _set_malloc(choices: tuple[tuple[int, int], ...]) -> None:
     if sys.platform == "linux":
         with contextlib.suppress(OSError, AttributeError):  # another C library
             for choice in choices:
@@ -184,7 +184,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     logging.basicConfig(format="firenet: %(message)s", level=logging.WARNING)
     name, rest = arguments[0], arguments[1:]
-    set_malloc(KEEP_FREED_MEMORY if name == "train" else RETURN_FREED_MEMORY)
+    _set_malloc(KEEP_FREED_MEMORY if name == "train" else RETURN_FREED_MEMORY)
     module, settings, _ = COMMANDS[name]
     for option in (word.partition("=")[0] for word in rest):
         if name == "reconstruct" and option in FORMER:

@@ -283,7 +283,7 @@ def test_other_systems_have_no_glibc(monkeypatch):
 
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setattr(cli.ctypes, "CDLL", windows)
-    cli.set_malloc(cli.RETURN_FREED_MEMORY)
+    cli._set_malloc(cli.RETURN_FREED_MEMORY)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits of this kind")
@@ -428,7 +428,7 @@ def test_what_may_not_be_read_is_named(here, capsys, monkeypatch):
 KEEPS = """
 import resource, threading
 from firenet_jax import cli
-cli.set_malloc(cli.KEEP_FREED_MEMORY)
+cli._set_malloc(cli.KEEP_FREED_MEMORY)
 
 def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
