@@ -67,7 +67,7 @@ from pytorch_firenet import (
     voxelise_original,
 )
 
-from firenet_jax.cli import HUGE_PAGES
+from firenet_jax.cli import HUGE_PAGES, KEEP_FREED_MEMORY
 from firenet_jax.events import Events
 from firenet_jax.native import by_xla_alone
 from firenet_jax.network import (
@@ -104,9 +104,10 @@ TRAIN = Train(output=Path("unused"), windows=10, batch=2, crop=96, loss=LOSS, op
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 COMPILER = shutil.which(os.environ.get("CXX", "g++"))
 
-# As `firenet train` has it (`cli.KEEP_FREED_MEMORY`), from the start, before there are threads.
-KEPT = "arena_max=1", "mmap_max=0", f"trim_threshold={2**31 - 1}"
-MALLOC = {"training": ":".join([HUGE_PAGES, *(f"glibc.malloc.{one}" for one in KEPT)])}
+# By the environment, as libraries imported above start threads, each with a heap of its own.
+TUNABLES = {-8: "arena_max", -4: "mmap_max", -1: "trim_threshold"}  # mallopt's numbers
+KEPT = [f"glibc.malloc.{TUNABLES[number]}={value}" for number, value in KEEP_FREED_MEMORY]
+MALLOC = {"training": ":".join([HUGE_PAGES, *KEPT])}
 
 NCHW, NHWC = torch.contiguous_format, torch.channels_last
 # Read when JAX and PyTorch are imported: what keeps each from instructions of AVX-512.
@@ -693,14 +694,14 @@ def main():
     options = parser.parse_args()
     if options.avx2 and not IS_AVX2:
         os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | AVX2)
+    if ONE_THREAD and (threads := torch.get_num_threads()) > 1:
+        parser.error(f"{threads} threads: start it as taskset -c 0 python ...")
     if "GLIBC_TUNABLES" not in os.environ:  # read as a program starts: a process for each part
         for part in options.parts.split(","):
             environment = os.environ | {"GLIBC_TUNABLES": MALLOC.get(part, HUGE_PAGES)}
             command = [sys.executable, *sys.argv, "--parts", part]
             subprocess.run(command, env=environment, check=True)
         return
-    if ONE_THREAD and (threads := torch.get_num_threads()) > 1:
-        parser.error(f"{threads} threads: start it as taskset -c 0 python ...")
     if DEVICE == "cuda":
         jax.config.update("jax_default_matmul_precision", "highest")
         torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False

@@ -30,7 +30,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # XLA compiles for most of the time that these take, for programs that run once on little data.
 # Here it does so with few optimisations, but for tests that are marked `optimised`. Processes that
-# tests start are compiled as a user's are, but for those with `processes.COMPILED_QUICKLY`.
+# tests start are compiled as a user's are, but for those with `processes.FEW_OPTIMISATIONS`.
 COMPILED_QUICKLY = (
     "test_batches.py", "test_blocks.py", "test_checkpoint.py", "test_choice.py", "test_colour.py",
     "test_dataset.py", "test_demo.py", "test_e2vid.py", "test_export.py", "test_losses.py",

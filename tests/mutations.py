@@ -1,6 +1,6 @@
 """One-line changes to the core -> how many of them the tests of the changed module find.
 
-    python tests/mutations.py --count 50 --seed 0          two hours and more on one core
+    python tests/mutations.py --count 50 --seed 0          a quarter of an hour
     python tests/mutations.py --only events windows        these modules' part of the same 50
 
 Change number n is a function of the seed, n and the code: another comparison, sign, number, truth

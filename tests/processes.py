@@ -7,18 +7,12 @@ import subprocess
 import sys
 
 # For what does not depend on how well XLA optimises: it compiles in a third of the time.
-COMPILED_QUICKLY = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+FEW_OPTIMISATIONS = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
 
 
 def start(script, *arguments, devices=1, **more):
-    environment = (
-        os.environ
-        | more
-        | {
-            "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
-            "JAX_PLATFORMS": "cpu",
-        }
-    )
+    more["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={devices}"
+    environment = os.environ | more | {"JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", script, *map(str, arguments)]
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
 
@@ -95,7 +89,7 @@ def with_little_room(folder, *lines, disk=None):
         command,
         cwd=folder, capture_output=True, text=True, timeout=900,
         # The limit would hold for the files of compiled programs that tests share, too.
-        env=os.environ | COMPILED_QUICKLY | {
+        env=os.environ | FEW_OPTIMISATIONS | {
             "JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false",
         },
     )  # fmt: skip

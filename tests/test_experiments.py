@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from processes import COMPILED_QUICKLY
+from processes import FEW_OPTIMISATIONS
 from test_pipeline import write_recording
 from test_snippets import write_with_frames
 
@@ -138,7 +138,6 @@ def test_runs(name, tmp_path):
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        # torch.compile takes half a minute, for what is run once.
-        env=os.environ | COMPILED_QUICKLY | {"TORCHDYNAMO_DISABLE": "1"},
+        env=os.environ | FEW_OPTIMISATIONS,
     )
     assert done.returncode == 0, done.stderr[-2000:]

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from processes import COMPILED_QUICKLY, finish, start, together
+from processes import FEW_OPTIMISATIONS, finish, start, together
 
 from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.commands.simulate import Picture, write_sequence
@@ -101,7 +101,7 @@ from firenet_jax.training.run import Train, run
 folder, chain, *where = sys.argv[1:]
 coordinator, processes, process = (where[0], int(where[1]), int(where[2])) if where else [None] * 3
 run(Train(Path(folder), batch=4, crop=32, windows=3, textures=4, log_every=1,
-    validate_every=10, save_every=0.0, loss=Loss(l0=1, haarpsi=0), scene=SceneSettings(objects=0),
+    validate_every=10, save_every=0.0, loss=Loss(l0=1), scene=SceneSettings(objects=0),
     chain=int(chain), coordinator=coordinator, processes=processes, process=process), stop=10)
 """
 
@@ -109,9 +109,9 @@ run(Train(Path(folder), batch=4, crop=32, windows=3, textures=4, log_every=1,
 @pytest.mark.slow
 def test_four_devices_and_two_processes_learn_what_one_device_learns(tmp_path):
     chain = 2
-    finish(start(TOGETHER, tmp_path / "one", chain, **COMPILED_QUICKLY))
-    finish(start(TOGETHER, tmp_path / "four", chain, devices=4, **COMPILED_QUICKLY))
-    together(TOGETHER, tmp_path / "two", chain, **COMPILED_QUICKLY)
+    finish(start(TOGETHER, tmp_path / "one", chain, **FEW_OPTIMISATIONS))
+    finish(start(TOGETHER, tmp_path / "four", chain, devices=4, **FEW_OPTIMISATIONS))
+    together(TOGETHER, tmp_path / "two", chain, **FEW_OPTIMISATIONS)
 
     one, four, two = (entries(tmp_path / name) for name in ("one", "four", "two"))
     assert len(one) == 11

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from processes import COMPILED_QUICKLY
+from processes import FEW_OPTIMISATIONS
 from test_native import pytestmark as pytestmark  # where there is machine code
 
 from firenet_jax import convolution, native
@@ -213,7 +213,7 @@ trial.assert_equal(found, trial.steps(False)(weights, state, tensors, valid))
 
 
 def run_alone(script, **environment):
-    environment = {"FIRENET_NATIVE": "1"} | COMPILED_QUICKLY | environment
+    environment = {"FIRENET_NATIVE": "1"} | FEW_OPTIMISATIONS | environment
     path = [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, path))} | environment
     subprocess.run([sys.executable, "-c", EQUAL + script], env=environment, check=True)
@@ -235,7 +235,7 @@ WITHOUT_AVX512 = pytest.param("avx2", marks=pytest.mark.slow)
 def test_nothing_is_touched_beside_the_arrays(switch):
     """Of the whole step and of a convolution and its gradients."""
     script = Path(__file__).with_name("guarded.py")
-    environment = os.environ | COMPILED_QUICKLY | {"FIRENET_NATIVE": switch}
+    environment = os.environ | FEW_OPTIMISATIONS | {"FIRENET_NATIVE": switch}
     subprocess.run([sys.executable, script], env=environment, check=True)
 
 
