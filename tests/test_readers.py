@@ -448,7 +448,7 @@ def test_wrong_ecd(tmp_path):
 def test_ecd_names_no_pictures_elsewhere(tmp_path, name):
     folder = ecd_folder(tmp_path / "recording")
     write(folder / "images.txt", f"0.0 images/a.png\n0.1 {name}\n")
-    refused(folder, f"images.txt, line 2: '{name}' lies elsewhere")
+    refused(folder, f"images.txt, line 2: '{name}' lies outside the recording")
 
 
 def test_ecd_of_enormous_parts(tmp_path, monkeypatch):

@@ -2,10 +2,10 @@
 
 A format is one module of this package with two functions:
 
-    matches(path: Path) -> bool                    is it mine? Cheap: name, first bytes
-    read(path: Path) -> Source                     what the file says, nothing checked yet
+    matches(path: Path) -> bool                    is it of this format? Cheap: name, first bytes
+    read(path: Path) -> Source                     what the file holds, not checked yet
 
-and a line in `FORMATS` below. A module raises RecordingError, in one sentence that names the file
+and its name in `FORMATS` below. A module raises RecordingError, in one sentence that names the file
 and the place, for what it cannot read; checks that all formats share (order of time, coordinates)
 are made here, by `events.checked`. Optional libraries are imported inside `read`, by `extra`. The
 functions below `open_recording` are what the modules share.
@@ -56,8 +56,8 @@ class Source:
     size: tuple[int, int] | None = None  # (height, width) where the file says it
     count: int | None = None  # number of events where the file says it
     frames: Frames | None = None
-    grey: bool = False  # whether the file says that the sensor sees no colours
-    triggers: Callable[[], Triggers | None] = no_triggers  # up to damage, of which events tell
+    grey: bool = False  # whether the file states that the sensor is monochrome
+    triggers: Callable[[], Triggers | None] = no_triggers  # up to damage, which `events` raises
     place: Callable[[int], str] = event_number  # row, from 0 -> its name in the file: "line 7"
 
 
@@ -74,8 +74,8 @@ def open_recording(
     A file is read up to where it is damaged, and single rows that cannot be events are left out,
     at most one in a thousand; a notice says what. strict: both raise RecordingError instead.
     columns: their order in a text or array that does not name them, such as "x,y,p,t".
-    Raises RecordingError for a file that is missing, empty, unknown, damaged or not to be read by
-    the user, and, when the events get there, for more bad rows than that.
+    Raises RecordingError for a file that is missing, empty, damaged, of an unknown format or not
+    permitted to the user, and, while the events are read, for more bad rows than that.
     """
     path = Path(path)
     if not path.exists():
@@ -91,9 +91,11 @@ def open_recording(
         module = importlib.import_module(f"{__name__}.{name}")
         if module.matches(path):
             if columns is not None and name not in ("text", "npy"):
-                raise RecordingError(f"{path}: is of a format that sets the order of its columns")
+                raise RecordingError(
+                    f"{path}: its format sets the order of its columns: leave out --columns"
+                )
             options: dict[str, Any] = {} if columns is None else {"columns": columns}
-            if name == "aedat2" and sensor_size is not None:  # its rows are counted from the bottom
+            if name == "aedat2" and sensor_size is not None:  # counts rows from the bottom
                 options["size"] = sensor_size
             source = module.read(path, **options)
             break
@@ -103,14 +105,14 @@ def open_recording(
             "an ECD or EVREAL folder, HDF5, .npy, .npz, N-Caltech101 .bin, .dat, .raw, .aedat, "
             ".aedat4, .es, or a ROS bag"
         )
-    said = 0
+    rows_reported = 0
 
     def say(sentence: str, rows: int) -> None:
-        """Once; again only by a pass that has read more."""
-        nonlocal said
-        if rows > said:
+        """Logs a warning; that of a later pass over the file only if it has read further."""
+        nonlocal rows_reported
+        if rows > rows_reported:
             logger.warning("%s (--strict refuses that)", sentence)
-        said = max(said, rows)
+        rows_reported = max(rows_reported, rows)
 
     def events(height: int | None, width: int | None) -> Iterator[Events]:
         return checked(source.events(), path, height, width, source.place, strict, say)
@@ -153,7 +155,7 @@ def _stated(path: Path, source: Source) -> tuple[int, int] | None:
 
 
 def _infer_size(path: Path, events: Iterator[Events]) -> tuple[int, int]:
-    """Reads all events for the largest coordinates: no file of this format names its sensor."""
+    """(height, width) that holds all events, for a file that states no size. Reads all of it."""
     height = width = 0
     for chunk in until_damage(events):
         height = max(height, int(chunk.y.max()) + 1)
@@ -171,13 +173,15 @@ def _infer_size(path: Path, events: Iterator[Events]) -> tuple[int, int]:
 
 
 def in_chunks(read: Callable[[slice], Events | Rows], count: int) -> Iterator[Events | Rows]:
-    """Random access -> chunks: for formats whose rows can be sliced."""
+    """Yields what `read` makes of each slice of up to CHUNK rows, from 0 to `count`: for formats
+    with random access."""
     for start in range(0, count, CHUNK):
         yield read(slice(start, min(start + CHUNK, count)))
 
 
 def joined(chunks: Iterable[Events | Rows], least: int = CHUNK // 4) -> Iterator[Events | Rows]:
-    """Tiny chunks -> chunks of at least so many events: for formats made of packets."""
+    """Tiny chunks -> chunks of at least so many events, the last excepted: for formats made of
+    packets. A RecordingError of `chunks` is raised after the events before it."""
     waiting, count, damage = [], 0, None
     try:
         for events in chunks:
@@ -186,7 +190,7 @@ def joined(chunks: Iterable[Events | Rows], least: int = CHUNK // 4) -> Iterator
             if count >= least:
                 yield concatenate(waiting)
                 waiting, count = [], 0
-    except RecordingError as error:  # after what came before it
+    except RecordingError as error:
         damage = error
     if count:
         yield concatenate(waiting)
@@ -195,14 +199,15 @@ def joined(chunks: Iterable[Events | Rows], least: int = CHUNK // 4) -> Iterator
 
 
 def all_triggers(pieces: Iterable[Iterable], *errors: type[BaseException]) -> Triggers | None:
-    """Pieces of (times, ids, polarity) -> all of them, up to one of these errors."""
+    """Pieces of (times in microseconds, ids, polarity) -> all of them, up to a RecordingError or
+    one of `errors`; None if there are no pieces."""
     columns = [[], [], []]
     try:
         for piece in pieces:
             for column, values in zip(columns, piece, strict=True):
                 column.append(np.asarray(values, np.int64))
     except (RecordingError, *errors):
-        pass  # whoever reads the events will hear of it
+        pass  # reading the events raises it
     if not columns[0]:
         return None
     times, ids, polarity = map(np.concatenate, columns)
@@ -215,7 +220,9 @@ def microseconds(seconds: np.ndarray) -> np.ndarray:
 
 
 def frame_times(path: Path, times: np.ndarray) -> np.ndarray:
-    """Microseconds where integer, seconds where floating -> (F,) int64 microseconds."""
+    """(F,) microseconds where integer, seconds where floating -> (F,) int64 microseconds.
+
+    Raises RecordingError for a time that is not finite."""
     if not np.isfinite(times).all():
         frame = int(np.argmin(np.isfinite(times)))
         raise RecordingError(f"{path}, frame {frame + 1}: its time is {times[frame]}")
@@ -225,26 +232,27 @@ def frame_times(path: Path, times: np.ndarray) -> np.ndarray:
 def to_events(
     path: Path, row: int, t, x, y, p, *, place: Callable[[int], str] = event_number
 ) -> Events | Rows:
-    """Columns as a file holds them -> Events; Rows where some hold what events cannot, with an
-    error that names the first of them, for `events.checked` to judge.
+    """Columns (N,) as a file holds them -> Events, or Rows if some rows cannot be events: their
+    error names the first of them, and `events.checked` decides whether to raise it.
 
     t: microseconds where integer, seconds where floating; p: bool, 0 and 1, or -1 and 1.
     row: the number of the first row in the recording, for `place`.
+    Raises RecordingError for columns that are not numbers.
     """
     t, x, y, p = (np.asarray(column) for column in (t, x, y, p))
     if not t.size:
         return Events.empty()
 
-    wrong: list[tuple[np.ndarray, np.ndarray, str, str]] = []  # bad rows, and what is said of them
+    wrong: list[tuple[np.ndarray, np.ndarray, str, str]] = []  # mask, column, name, expected
     for name, column in (("the time", t), ("x", x), ("y", y), ("the polarity", p)):
         if column.dtype.kind not in "biuf":
             raise RecordingError(f"{path}: {name} is stored as {column.dtype}, expected numbers")
     latest = MAX_TIME / 1e6 if t.dtype.kind == "f" else MAX_TIME
-    if not (-latest < t.min() and t.max() < latest):  # so put that NaN fails
+    if not (-latest < t.min() and t.max() < latest):  # written so that NaN fails
         bad = ~((-latest < t) & (t < latest))
         wrong.append((bad, t, "the time", "expected seconds or whole microseconds"))
     for name, column in (("x", x), ("y", y)):
-        if column.dtype.kind == "f" and (column != np.rint(column)).any():  # so does NaN
+        if column.dtype.kind == "f" and (column != np.rint(column)).any():  # NaN differs, too
             bad = column != np.rint(column)
             wrong.append((bad, column, name, "expected a whole number of pixels"))
         if not (-LONGEST_SIDE <= column.min() and column.max() < LONGEST_SIDE):
@@ -270,7 +278,9 @@ def to_events(
 
 
 def to_frame(picture: np.ndarray, path: Path) -> np.ndarray:
-    """A picture as a file holds it, grey or RGB, 8 or 16 bit -> (H, W) uint8."""
+    """A picture as a file holds it, (H, W) or (H, W, 1, 3 or 4), uint8 or uint16 -> (H, W) uint8.
+
+    Raises RecordingError for any other."""
     picture = np.asarray(picture)
     if picture.ndim == 3 and picture.shape[-1] == 1:
         picture = picture[..., 0]
@@ -288,7 +298,7 @@ def to_frame(picture: np.ndarray, path: Path) -> np.ndarray:
 
 
 def unwrap(counter: np.ndarray, bits: int, last: int) -> np.ndarray:
-    """A counter that starts again from 0 after 2^bits -> int64 that keeps growing.
+    """(N,) values of a counter of so many bits, which wraps around -> int64 that keeps growing.
 
     last: its unwrapped value just before. Falls of more than half its range are wraps; smaller
     ones are left as they are, for `events.checked` to judge.
@@ -311,7 +321,8 @@ def extra(module: str, path: Path) -> ModuleType:
 
 @contextmanager
 def reading(path: Path, *errors: type[BaseException]):
-    """What libraries raise for a damaged file becomes a RecordingError that names it."""
+    """Turns `errors`, as libraries raise them for a damaged file, into a RecordingError that names
+    it."""
     try:
         yield
     except RecordingError:

@@ -1,4 +1,4 @@
-"""The head of an AEDAT file -> its version, its lines of text, and the sensor that a line names.
+"""The header of an AEDAT file -> its version, its lines of text, the sensor that a line names.
 
 #!AER-DAT2.0\r\n       the first line says which format it is: aedat2.py, aedat3.py, aedat4.py
 # any text\r\n         further lines start with #; 3.1 ends them with #!END-HEADER, and recent
@@ -26,7 +26,7 @@ SENSORS = {
 
 
 def version(path: Path) -> str | None:
-    """ "2.0", "3.1" or "4.0", as the first bytes of a file of such a name say it."""
+    """ "2.0", "3.1" or "4.0" as the first bytes say; None if they do not, or for other suffixes."""
     if not path.is_file() or path.suffix.lower() not in SUFFIXES:
         return None
     with open(path, "rb") as file:
@@ -35,8 +35,8 @@ def version(path: Path) -> str | None:
 
 
 def read_header(file: BufferedReader) -> list[str]:
-    """The lines that start with #; leaves the file behind them. An event whose first byte is that
-    of # is no line: it holds bytes that no text has."""
+    """The lines that start with #, without their ends; leaves the file at the first byte after
+    them. An event may begin with the byte of #, too: the control characters in it tell."""
     lines = []
     while file.peek(1)[:1] == b"#":
         start = file.tell()
@@ -57,5 +57,5 @@ def sensor_size(name: str) -> tuple[int, int] | None:
 
 
 def is_grey(name: str) -> bool:
-    """Whether the sensor of this name was never made with a colour mosaic."""
+    """Whether no sensor of this name has a colour filter array."""
     return re.search(r"dvs|davis240|sbret|xplorer", name.rpartition(".")[2].lower()) is not None

@@ -1,20 +1,21 @@
-"""AEDAT-2.0 -> Source: jAER's file, an address and a time for all that the camera says; v2e's too.
+"""AEDAT-2.0 -> Source: jAER's and v2e's file, an address and a time for all that a camera sends.
 
     #...             lines of text (aedat.py), of which `# AEChip: ...` names the chip
     uint32 address   big-endian; what its bits are depends on the chip:
-        DAVIS    bit 31: 0 for events, whose y are bits 30-22, x 21-12, polarity 11, and of which
-                 bit 10 tells the edges at the trigger input apart; 1 for the pictures' pixels, with
-                 y and x there too, and IMU samples (bit 11 set), which are passed over; a pixel is
-                 read twice, after its reset (bit 10 clear) and after its exposure (bit 10 set):
-                 the brighter, the further has its level (bits 9-0) fallen
+        DAVIS    bit 31 clear: an event, y bits 30-22, x 21-12, polarity 11; or, with bit 10 set, an
+                 edge at the trigger input
+                 bit 31 set: a pixel of a picture, y and x as above; or, with bit 11 set, an IMU
+                 sample, which is not read; each pixel is read twice, after its reset (bit 10 clear)
+                 and after its exposure (set): the brighter it is, the further its level (bits 9-0)
+                 has fallen
         DVS128   y bits 14-8, x 7-1, bit 0: 0 for brighter; bit 15: an edge at the trigger input
         DVS640   y bits 20-11, x 10-1, polarity 0: as v2e writes 640x480
     uint32 time      microseconds
 
 Rows are counted from the bottom. Columns of events are counted from the right, those of pixels from
 the left (jAER, DavisBaseCamera and DVS128). A picture is at the middle of its exposure. v2e and old
-files name no chip: the layout is that which the addresses fit, of the smallest sensor that they
-fit. Files do not tell rising from falling edges.
+files name no chip: layout and sensor are then inferred from the addresses, the smallest sensor that
+holds them. The files do not tell rising edges from falling ones.
 """
 
 import re
@@ -33,7 +34,7 @@ LEVEL = 0x3FF
 
 
 class Layout(NamedTuple):
-    """Where a chip's addresses hold what."""
+    """What the bits of a chip's addresses hold."""
 
     x: int  # its lowest bit
     x_bits: int
@@ -41,7 +42,7 @@ class Layout(NamedTuple):
     y_bits: int
     polarity: int
     brighter: int  # the polarity of events that became brighter
-    edge: int  # bits that tell edges at the trigger input from events
+    edge: int  # mask: an address with any of these bits set is an edge at the trigger input
     pictures: bool
     sizes: tuple[tuple[int, int], ...]  # (height, width) of its sensors
 
@@ -64,11 +65,11 @@ CHIPS = {
 
 class File(NamedTuple):
     path: Path
-    begin: int  # of the addresses, bytes from the beginning of the file
+    begin: int  # of the first address, bytes from the beginning of the file
     layout: Layout
     size: tuple[int, int]  # (height, width)
-    edges: bool  # whether the bits of edges are those of edges
-    grey: bool  # whether the chip sees no colours
+    edges: bool  # whether `layout.edge` marks edges: v2e may mark noise events with it
+    grey: bool  # whether the chip is monochrome
 
 
 def matches(path: Path) -> bool:
@@ -76,7 +77,7 @@ def matches(path: Path) -> bool:
 
 
 def read(path: Path, size: tuple[int, int] | None = None) -> Source:
-    """size: (height, width), which counts for a file that names no chip."""
+    """size: (height, width) of a file that names no chip, or one of unknown size."""
     version = aedat.version(path)
     if version != "2.0":
         found = "names no version of AEDAT" if version is None else f"is AEDAT-{version}"
@@ -121,8 +122,9 @@ def _file(path: Path, size: tuple[int, int] | None) -> File:
 def _inferred(
     path: Path, begin: int, size: tuple[int, int] | None
 ) -> tuple[Layout, tuple[int, int]]:
-    """Reads all addresses for the layout that they fit, and the size where it is not given."""
-    used, reach = 0, np.zeros(4, np.int64)
+    """(layout, (height, width)) that fit all addresses; `size`, where given, is taken as it is."""
+    used = 0  # bits that are set in any address
+    reach = np.zeros(4, np.int64)  # largest row and column, as of a DAVIS and as of a DVS640
     for _, address, _ in _records(path, begin):
         address = address[address < PICTURE]
         if len(address):
@@ -208,26 +210,26 @@ def _triggers(file: File) -> Triggers | None:
 
 
 class Scan(NamedTuple):
-    """One reading of the pixels, whole or not."""
+    """One readout of all pixels, complete or not."""
 
-    first: int  # record
+    first: int  # number of its first record
     last: int
     count: int
     begin: int  # microseconds
     end: int
-    total: int  # of all times since the first
+    total: int  # sum of its pixels' times, each from `begin` on
 
 
 def _frames(file: File) -> Frames | None:
-    """Of the pictures that are whole: each pixel was read after its reset and its exposure."""
+    """The complete pictures: each pixel was read after its reset and after its exposure."""
     scans: dict[int, list[Scan]] = {0: [], EXPOSED: []}
-    corner: dict[int, np.ndarray | None] = {0: None, EXPOSED: None}  # the last pixel, (x, y)
+    last: dict[int, np.ndarray | None] = {0: None, EXPOSED: None}  # the pixel read last, (x, y)
     for number, address, time in _records(file.path, file.begin):
         pixel = np.flatnonzero((address & (PICTURE | IMU)) == PICTURE)
         for kind, found in scans.items():
             of_kind = pixel[(address[pixel] & EXPOSED) == kind]
             if len(of_kind):
-                pieces, corner[kind] = _scans(file, number, address, time, of_kind, corner[kind])
+                pieces, last[kind] = _scans(file, number, address, time, of_kind, last[kind])
                 if found and pieces[0] is not None:
                     found[-1] = _merged(found[-1], pieces[0])
                 found += [piece for piece in pieces[1:] if piece is not None]
@@ -244,6 +246,7 @@ def _scans(
 ) -> tuple[list[Scan | None], np.ndarray]:
     """-> [the rest of the scan that was going on, or None; further scans ...], the last pixel
 
+    before: the last pixel of the records before these, (x, y).
     Scans go from one corner to the opposite one, by columns or by rows, so a new one begins where
     both coordinates jump by more than half of the sensor.
     """
@@ -279,7 +282,8 @@ def _merged(a: Scan, b: Scan) -> Scan:
 
 
 def _pairs(resets: list[Scan], exposed: list[Scan], pixels: int) -> list[tuple[Scan, Scan]]:
-    """Each scan after an exposure with the last one after a reset that began before it."""
+    """(scan after the reset, scan after the exposure) of each picture, both complete: the former is
+    the last that began before the latter."""
     begins, pairs = np.array([scan.first for scan in resets]), []
     for scan in exposed:
         at = int(np.searchsorted(begins, scan.first)) - 1
@@ -289,8 +293,9 @@ def _pairs(resets: list[Scan], exposed: list[Scan], pixels: int) -> list[tuple[S
 
 
 def _middle(reset: Scan, exposed: Scan) -> int:
-    """Of the exposure. A global shutter opens behind the reset of the last pixel and closes before
-    the reading of the first; a rolling one exposes each pixel for itself: the mean of them."""
+    """The middle of the exposure, microseconds. A global shutter opens after the last pixel's reset
+    and closes before the first one is read; a rolling one exposes each pixel at its own time, of
+    which this is the mean."""
     if reset.end <= exposed.begin:
         return (reset.end + exposed.begin) // 2
     return sum(scan.begin + scan.total // scan.count for scan in (reset, exposed)) // 2

@@ -1,17 +1,18 @@
-"""AEDAT-3.1 -> Source: the file of cAER and of DV before it had its own, packets of one kind each.
+"""AEDAT-3.1 -> Source: the file of cAER and early DV, packets that hold entries of one kind each.
 
     #...             lines of text (aedat.py): `#Format: RAW`, `#Source 1: DAVIS240C`
-    28 bytes         int16 kind, int16 source, int32: size of an entry, place of its time in it,
-                     how often the times' 31 bits have started again, capacity, entries, valid ones
-    entries          little-endian; bit 0 of each says whether it is valid, and others are left out
+    28 bytes         header of a packet: int16 kind, int16 source, int32 each: size of an entry,
+                     offset of the time in it, how often the times' 31 bits have wrapped around,
+                     capacity, number of entries, of valid ones
+    entries          little-endian; bit 0 of each says whether it is valid; invalid ones are skipped
         0 special    uint32: kind (bits 1-7), int32 time: an edge at a trigger input, and others
         1 polarity   uint32: polarity (bit 1), y (2-16), x (17-31), int32 time
-        2 frame      uint32: channels (1-3), int32 times of the frame's begin and end and of its
-                     exposure's, width, height, column and row of its corner, uint16 pixels
-        others       are passed over
+        2 frame      uint32: channels (bits 1-3), int32 each: begin and end of the frame, begin and
+                     end of its exposure, width, height, column and row of its corner; uint16 pixels
+        others       are skipped
 
 Times are microseconds; a frame is at the middle of its exposure. Of several cameras the first with
-events is read. Frames of parts of the sensor are passed over.
+events is read. Frames of parts of the sensor are skipped.
 """
 
 import re
@@ -37,10 +38,10 @@ FRAME_HEAD = np.dtype(
     [("info", "<u4"), ("begin", "<i4"), ("end", "<i4"), ("open", "<i4"), ("shut", "<i4"),
      ("width", "<i4"), ("height", "<i4"), ("x", "<i4"), ("y", "<i4")]
 )  # fmt: skip
-# special kinds: (input, whether the edge rises); a pulse counts as a rising edge
+# kind of a special entry: (input, 1 for a rising edge); a pulse counts as a rising edge
 EDGES = {2: (0, 1), 3: (0, 0), 4: (0, 1), 6: (1, 1), 7: (1, 0), 8: (1, 1), 9: (2, 1), 10: (2, 0),
          11: (2, 1)}  # fmt: skip
-PIECE = 1 << 18  # events of a packet that are taken at once
+PIECE = 1 << 18  # entries of a packet that are read at once
 
 
 class Packet(NamedTuple):
@@ -49,14 +50,14 @@ class Packet(NamedTuple):
     size: int  # bytes of an entry
     wraps: int
     count: int
-    place: int  # of the first entry, bytes from the beginning of the file
+    offset: int  # of the first entry, bytes from the beginning of the file
 
 
 class Layout(NamedTuple):
     """What is known of a file before its events are read."""
 
     path: Path
-    begin: int  # of the packets
+    begin: int  # of the first packet, bytes from the beginning of the file
     source: int  # the camera
 
 
@@ -105,21 +106,22 @@ def _camera(path: Path, begin: int) -> int:
 
 
 def _packets(path: Path, file: BinaryIO, begin: int) -> Iterator[Packet]:
-    """Of all kinds; the file is left anywhere. Raises RecordingError where no whole one is."""
+    """Of all kinds; moves the file's position. Raises RecordingError at one that is not whole."""
     at, end = begin, path.stat().st_size
     while at < end:
         file.seek(at)
         data = file.read(HEAD.itemsize)
         head = np.frombuffer(data, HEAD)[0] if len(data) == HEAD.itemsize else None
         size, count = (0, 0) if head is None else (int(head["size"]), int(head["count"]))
-        place = at + HEAD.itemsize
-        if head is None or size <= 0 or count < 0 or place + size * count > end:
+        offset = at + HEAD.itemsize
+        if head is None or size <= 0 or count < 0 or offset + size * count > end:
             raise RecordingError(
                 f"{path}: cannot be read from byte {at} on, where no whole packet is: the file is "
                 "cut off or damaged: copy or download it again"
             )
-        yield Packet(int(head["kind"]), int(head["source"]), size, int(head["wraps"]), count, place)
-        at = place + size * count
+        kind, source, wraps = (int(head[name]) for name in ("kind", "source", "wraps"))
+        yield Packet(kind, source, size, wraps, count, offset)
+        at = offset + size * count
 
 
 def _of_kind(layout: Layout, kind: int) -> Iterator[tuple[Packet, BinaryIO]]:
@@ -134,12 +136,12 @@ def _columns(layout: Layout, kind: int) -> Iterator[tuple[np.ndarray, np.ndarray
     for packet, file in _of_kind(layout, kind):
         if packet.size != EVENT.itemsize:
             raise RecordingError(
-                f"{layout.path}: has entries of {packet.size} bytes at byte {packet.place}, "
+                f"{layout.path}: has entries of {packet.size} bytes at byte {packet.offset}, "
                 f"expected {EVENT.itemsize}: the file is damaged: copy or download it again"
             )
         for first in range(0, packet.count, PIECE):
             count = min(PIECE, packet.count - first)
-            file.seek(packet.place + first * packet.size)
+            file.seek(packet.offset + first * packet.size)
             entries = np.frombuffer(file.read(count * packet.size), EVENT)
             entries = entries[entries["data"] & 1 > 0]
             yield entries["data"], entries["t"].astype(np.int64) + (packet.wraps << 31)
@@ -163,28 +165,27 @@ def _triggers(layout: Layout) -> Triggers | None:
 
 
 def _frames(layout: Layout) -> Frames | None:
-    """Up to the first that is damaged: whoever reads the events will hear of it."""
-    times, places = [], []
+    """Up to the first that is damaged; a damaged packet raises its error as events are read."""
+    times, entries = [], []  # an entry: (offset, bytes)
     try:
         for packet, file in _of_kind(layout, FRAME):
-            for place in range(
-                packet.place, packet.place + packet.size * packet.count, packet.size
-            ):
-                head = _frame_head(file, place, packet.size)
+            for number in range(packet.count):
+                offset = packet.offset + number * packet.size
+                head = _frame_head(file, offset, packet.size)
                 if head["info"] & 1 and head["x"] == head["y"] == 0:
                     begin, end = int(head["open"]), int(head["shut"])
                     times.append((begin + end) // 2 + (packet.wraps << 31))
-                    places.append((place, packet.size))
+                    entries.append((offset, packet.size))
     except (RecordingError, ValueError):
         pass
-    if not places:
+    if not entries:
         return None
-    return Frames(np.array(times, np.int64), lambda i: _frame(layout.path, *places[i]))
+    return Frames(np.array(times, np.int64), lambda i: _frame(layout.path, *entries[i]))
 
 
-def _frame_head(file: BinaryIO, place: int, size: int) -> np.void:
+def _frame_head(file: BinaryIO, offset: int, size: int) -> np.void:
     """Raises ValueError where its pixels do not fit into the entry."""
-    file.seek(place)
+    file.seek(offset)
     head = np.frombuffer(file.read(min(size, FRAME_HEAD.itemsize)), FRAME_HEAD)[0]
     height, width, channels = int(head["height"]), int(head["width"]), _channels(head)
     room = size - FRAME_HEAD.itemsize
@@ -197,9 +198,9 @@ def _channels(head: np.void) -> int:
     return int(head["info"]) >> 1 & 7
 
 
-def _frame(path: Path, place: int, size: int) -> np.ndarray:
+def _frame(path: Path, offset: int, size: int) -> np.ndarray:
     with open(path, "rb") as file, reading(path, ValueError, IndexError):
-        head = _frame_head(file, place, size)
+        head = _frame_head(file, offset, size)
         shape = int(head["height"]), int(head["width"]), _channels(head)
         pixels = np.frombuffer(file.read(2 * int(np.prod(shape))), "<u2").reshape(shape)
     return to_frame((pixels >> 8).astype(np.uint8), path)

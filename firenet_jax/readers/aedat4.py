@@ -3,15 +3,15 @@
     14 bytes     #!AER-DAT4.0\\r\\n
     uint32       size of the header, a flatbuffer: compression (0 none, 1 and 2 LZ4, 3 and 4 ZSTD),
                  where the packets end (-1: not known), XML that names the streams and their sizes
-    packets      int32 stream, int32 size, so many bytes: a flatbuffer behind its own size
+    packets      int32 stream, int32 size, so many bytes: a flatbuffer after its own size
       EVTS       a vector of events, 16 bytes each: int64 time, int16 x, int16 y, bool
       FRME       times (0: of the frame, 3 and 4: of its exposure), format, width, height, pixels
-      others     are passed over
+      others     are skipped
     table        of all packets, compressed too; not read
 
 Numbers are little-endian, times microseconds; a frame is at the middle of its exposure. Of several
-cameras the first is read. Each number that says where others are is checked before it is followed:
-libraries for this format end the whole process at a damaged file (faery), or are large.
+cameras the first is read. Each offset is checked before it is followed. Libraries for this format
+are not used: they end the whole process at a damaged file (faery), or are large.
 """
 
 import struct
@@ -31,8 +31,8 @@ MAGIC = b"#!AER-DAT4.0\r\n"
 CODECS = {0: None, 1: "lz4", 2: "lz4", 3: "zstd", 4: "zstd"}
 HEADER = 1 << 24  # bytes of a header at most
 PACKET = 1 << 28  # bytes of an unpacked packet at most: 16 million events
-PIECE = 1 << 20
-HEAD = 1 << 10  # bytes of a frame in which all but its pixels lies
+PIECE = 1 << 20  # bytes that are unpacked at once
+HEAD = 1 << 10  # bytes at the beginning of a frame's packet that hold all but the pixels
 EVENT = np.dtype(
     {
         "names": ["t", "x", "y", "on"],
@@ -41,10 +41,10 @@ EVENT = np.dtype(
         "itemsize": 16,
     }
 )
-CHANNELS = {0: 1, 16: 3, 24: 4}  # OpenCV's numbers for grey, BGR, BGRA of 8 bits
-# kinds: (input, whether the edge rises); a pulse counts as a rising edge, the output as input 1
+CHANNELS = {0: 1, 16: 3, 24: 4}  # OpenCV's type numbers of grey, BGR, BGRA of 8 bits: channels
+# kinds: (input, 1 for a rising edge); a pulse counts as a rising edge, the output as input 1
 EDGES = {1: (0, 1), 2: (0, 0), 3: (0, 1), 4: (1, 1), 5: (1, 0)}
-NOWHERE = -1  # where a field points to that is not there
+NOWHERE = -1  # the offset of what is not in the table
 DAMAGED = struct.error, ValueError, IndexError, OSError  # what damaged bytes raise here
 
 
@@ -52,12 +52,12 @@ class Layout(NamedTuple):
     """What the header says."""
 
     codec: str | None
-    begin: int  # of the packets, bytes from the beginning of the file
+    begin: int  # of the first packet, bytes from the beginning of the file
     end: int | None  # of the packets; None: that of the file
     events: int  # stream
     frames: int | None  # stream; None: no frames
     size: tuple[int, int] | None  # (height, width)
-    explorer: bool  # whether the camera is a DVXplorer, of which none sees colours
+    explorer: bool  # whether the camera is a DVXplorer: all of them are monochrome
     triggers: int | None  # stream; None: no triggers
 
 
@@ -83,18 +83,19 @@ def read(path: Path) -> Source:
 
 
 def _number(data: bytes, at: int, kind: str) -> int:
-    """kind: as in `struct`. Raises struct.error where it lies outside."""
+    """kind: as in `struct`. Raises struct.error or ValueError where it lies outside."""
     if at < 0:
-        raise ValueError("a place before the beginning")
+        raise ValueError("an offset before the beginning")
     return struct.unpack_from("<" + kind, data, at)[0]
 
 
 def _root(data: bytes, start: int = 0) -> int:
+    """Offset of the table that a flatbuffer, or an entry of a vector of tables, points to."""
     return start + _number(data, start, "I")
 
 
 def _field(data: bytes, table: int, number: int, kind: str, default: int = 0) -> int:
-    """A number of a table; with the kind "at" the place that it points to."""
+    """A number of a table; with the kind "at" the offset that it points to."""
     entries = table - _number(data, table, "i")
     offset = 0
     if 4 + 2 * number < _number(data, entries, "H"):
@@ -107,10 +108,10 @@ def _field(data: bytes, table: int, number: int, kind: str, default: int = 0) ->
 
 
 def _vector(data: bytes, at: int, itemsize: int) -> tuple[int, int]:
-    """(place of its first entry, how many there are)"""
+    """(offset of its first entry, how many there are)"""
     count = _number(data, at, "I")
     if at + 4 + count * itemsize > len(data):
-        raise ValueError("a list that goes on behind the end")
+        raise ValueError("a list that goes on past the end")
     return at + 4, count
 
 
@@ -123,12 +124,12 @@ def _layout(path: Path) -> Layout:
     with open(path, "rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise RecordingError(
-                f"{path}: cannot be read as AEDAT4: it begins in another way: {remedy}"
+                f"{path}: cannot be read as AEDAT4: its first line is not #!AER-DAT4.0: {remedy}"
             )
         try:
             size = _number(file.read(4), 0, "I")
             if size > HEADER:
-                raise ValueError(f"of {size} bytes")
+                raise ValueError(f"it claims {size} bytes")
             header, begin = file.read(size), file.tell()
             table = _root(header)
             codec = _field(header, table, 0, "i")
@@ -160,7 +161,7 @@ def _layout(path: Path) -> Layout:
 
 
 def _streams(text: bytes) -> dict[int, tuple[str, tuple[int, int] | None]]:
-    """XML -> number of a stream: (kind, (height, width) if it says so)"""
+    """XML -> number of a stream: (kind, (height, width) where it states them)"""
     found = {}
     for node in ElementTree.fromstring(text.rstrip(b"\0").strip()).iter("node"):
         said = {attribute.get("key"): attribute.text for attribute in node.findall("attr")}
@@ -174,7 +175,7 @@ def _streams(text: bytes) -> dict[int, tuple[str, tuple[int, int] | None]]:
 
 
 def _packets(path: Path, file: BinaryIO, layout: Layout, stream: int) -> Iterator[tuple[int, int]]:
-    """(place, size) of the packets of a stream; the file is left anywhere."""
+    """(offset, size) of the packets of a stream; moves the file's position."""
     at, end = layout.begin, path.stat().st_size
     last = end if layout.end is None else layout.end
     while at < last:
@@ -191,9 +192,9 @@ def _packets(path: Path, file: BinaryIO, layout: Layout, stream: int) -> Iterato
         at += 8 + size
 
 
-def _unpacked(file: BinaryIO, layout: Layout, place: int, size: int, most: int = PACKET) -> bytes:
-    """A packet's flatbuffer, or the first bytes of it, without the size before it."""
-    file.seek(place)
+def _unpacked(file: BinaryIO, layout: Layout, offset: int, size: int, most: int = PACKET) -> bytes:
+    """A packet's flatbuffer without the size before it; with `most`, only so many bytes of it."""
+    file.seek(offset)
     data = file.read(size)
     if layout.codec:
         with pa.CompressedInputStream(pa.BufferReader(data), layout.codec) as stream:
@@ -204,7 +205,8 @@ def _unpacked(file: BinaryIO, layout: Layout, place: int, size: int, most: int =
 
 
 def up_to(stream, most: int) -> bytes:
-    """So many bytes at most, piece by piece: a stream of pyarrow makes room for all it is asked."""
+    """Reads at most so many bytes, piece by piece: pyarrow's streams allocate all that is asked for
+    at once."""
     pieces, missing = [], most
     while missing and (piece := stream.read(min(missing, PIECE))):
         pieces.append(piece)
@@ -215,11 +217,11 @@ def up_to(stream, most: int) -> bytes:
 def _events(path: Path, layout: Layout) -> Iterator[Events | Rows]:
     row = 0
     with open(path, "rb") as file:
-        for place, size in _packets(path, file, layout, layout.events):
+        for offset, size in _packets(path, file, layout, layout.events):
             with reading(path, *DAMAGED):
-                data = _unpacked(file, layout, place, size)
+                data = _unpacked(file, layout, offset, size)
                 start = _field(data, _root(data), 0, "at", NOWHERE)
-                if start == NOWHERE:  # a packet of nothing
+                if start == NOWHERE:  # an empty packet
                     continue
                 start, count = _vector(data, start, EVENT.itemsize)
                 events = np.frombuffer(data, EVENT, count, start)
@@ -231,8 +233,8 @@ def _events(path: Path, layout: Layout) -> Iterator[Events | Rows]:
 def _triggers(path: Path, layout: Layout) -> Triggers | None:
     def pieces(stream: int):
         with open(path, "rb") as file:
-            for place, size in _packets(path, file, layout, stream):
-                data = _unpacked(file, layout, place, size)
+            for offset, size in _packets(path, file, layout, stream):
+                data = _unpacked(file, layout, offset, size)
                 start = _field(data, _root(data), 0, "at", NOWHERE)
                 start, count = (0, 0) if start == NOWHERE else _vector(data, start, 4)
                 edges = []
@@ -249,28 +251,28 @@ def _triggers(path: Path, layout: Layout) -> Triggers | None:
 
 
 def _frames(path: Path, layout: Layout) -> Frames | None:
-    """Up to the first that is damaged: whoever reads the events will hear of it."""
+    """Up to the first that is damaged; a damaged packet raises its error as events are read."""
     if layout.frames is None:
         return None
-    times, places = [], []
+    times, packets = [], []  # a packet: (offset, size)
     try:
         with open(path, "rb") as file:
-            for place, size in _packets(path, file, layout, layout.frames):
-                times.append(_time(_unpacked(file, layout, place, size, HEAD)))
-                places.append((place, size))
+            for offset, size in _packets(path, file, layout, layout.frames):
+                times.append(_time(_unpacked(file, layout, offset, size, HEAD)))
+                packets.append((offset, size))
     except (RecordingError, *DAMAGED):
         pass
-    if not places:
+    if not packets:
         return None
-    times = np.array(times[: len(places)], np.int64)
-    return Frames(times, lambda i: _frame(path, layout, places[i]))
+    times = np.array(times[: len(packets)], np.int64)
+    return Frames(times, lambda i: _frame(path, layout, packets[i]))
 
 
 def _is_grey(path: Path, layout: Layout, stream: int) -> bool:
-    """Whether the first frame has one channel: cameras with a mosaic write colours."""
+    """Whether the first frame has one channel: cameras with a colour filter array write more."""
     with open(path, "rb") as file:
-        place, size = next(_packets(path, file, layout, stream))
-        data = _unpacked(file, layout, place, size, HEAD)
+        offset, size = next(_packets(path, file, layout, stream))
+        data = _unpacked(file, layout, offset, size, HEAD)
     return _field(data, _root(data), 5, "b") == 0
 
 

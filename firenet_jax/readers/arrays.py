@@ -1,4 +1,4 @@
-"""Arrays of one's own -> Recording: the same checks as a file's, and each says which array."""
+"""Arrays in memory -> Recording, with the same checks as a file; errors name the array."""
 
 import math
 from numbers import Real
@@ -11,7 +11,7 @@ from firenet_jax.events import Events, Recording, Rows, checked
 from firenet_jax.readers import in_chunks, to_events
 from firenet_jax.readers.text import NAMES
 
-UNITS = {"s": None, "ms": 1000, "us": 1}  # microseconds; seconds are read as floating numbers
+UNITS = {"s": None, "ms": 1000, "us": 1}  # in microseconds; seconds become float64
 
 
 def recording(
@@ -27,12 +27,12 @@ def recording(
 ) -> Recording:
     """Columns t, x, y, p of N events, or one structured array with fields of these names.
 
-    t: in order; unit "s", "ms" or "us", where nothing is said microseconds if they are whole
-    numbers and seconds if they are floating ones. x: column, 0 to width - 1; y: row. p: bool, 0 and
-    1, or -1 and 1, true for brighter. name: what errors call it.
-    The arrays are not copied: leave them as they are while the recording is used.
-    Raises RecordingError, a ValueError, for columns that do not fit together and for the first
-    event that cannot be.
+    t: (N,), in order. unit: "s", "ms" or "us"; None: integers are microseconds, floating numbers
+    seconds. x: (N,) column, 0 to width - 1; y: (N,) row, 0 to height - 1. p: (N,) bool, 0 and 1, or
+    -1 and 1, true for brighter. width, height: of the sensor, pixels. name: what errors call it.
+    The arrays are not copied: do not change them while the recording is used.
+    Raises RecordingError, a ValueError, for columns that do not fit together, for a width, height
+    or unit that cannot be, and for the first invalid event.
     """
     if x is None and y is None and p is None:
         t, x, y, p = _fields(name, np.asarray(t))
@@ -58,7 +58,7 @@ def recording(
     def events():
         return checked(in_chunks(read, len(columns["t"])), path, height, width)
 
-    for _ in events():  # now, where the arrays come from, and not in the middle of a loop
+    for _ in events():  # raises errors here, at the caller's arrays, not in a later loop
         pass
     return Recording(path, "arrays", height, width, events, len(columns["t"]))
 

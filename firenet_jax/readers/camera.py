@@ -2,11 +2,11 @@
 
     .raw      Prophesee: lines of text that start with %, then words of 32, 64 or 16 bits; the size
               of the sensor is taken from the header only (faery guesses 1280x720 without)
-    .es       Event Stream: 5 bytes an event, rows counted from the bottom (turned round here)
+    .es       Event Stream: 5 bytes an event, rows counted from the bottom (faery turns them round)
 
-Edges at trigger inputs are read without faery, which passes them over (evt2.py, evt3.py; those of
-EVT2.1 are not read). Times are microseconds. faery holds back a time that falls below an earlier
-one to that one. A .raw or .es file that was cut off between two words looks whole: neither says how
+Edges at trigger inputs are read without faery, which skips them (evt2.py, evt3.py; those of EVT2.1
+are not read). Times are microseconds. faery clamps a time that falls below an earlier one to that
+one. A .raw or .es file that was cut off between two words looks whole: neither says how
 long it is.
 """
 
@@ -33,11 +33,12 @@ from firenet_jax.readers import (
 from firenet_jax.readers.dat import header_size, read_header
 
 FORMATS = {".raw": "Prophesee raw", ".es": "Event Stream"}
-WORD = {"2": 4, "2.0": 4, "2.1": 8, "21": 8, "3": 2, "3.0": 2}  # version: bytes
+WORD = {"2": 4, "2.0": 4, "2.1": 8, "21": 8, "3": 2, "3.0": 2}  # EVT version: bytes of a word
+# of triggers, by EVT version: function, state at the beginning, type of a word
 DECODERS = {
     "2": (evt2.triggers, -1, np.dtype("<u4")),
     "3": (evt3.triggers, evt3.State(), np.dtype("<u2")),
-}  # of triggers: function, state at the beginning, words
+}
 LARGEST = (2048, 2048)  # what EVT's 11 bits reach, so that faery refuses nothing
 
 
@@ -65,8 +66,8 @@ def read(path: Path) -> Source:
 
 
 def _raw_header(path: Path) -> tuple[str, tuple[int, int] | None, bool, str, int]:
-    """-> "Prophesee raw (EVT3)", (height, width) where the header says it, whether a word is cut,
-    the version, where words begin, bytes from the beginning of the file"""
+    """-> "Prophesee raw (EVT3)", (height, width) where the header states it, whether the last word
+    is cut off, the EVT version, where words begin, bytes from the beginning of the file"""
     with open(path, "rb") as file:
         header = read_header(file)
         start = file.tell()
@@ -82,7 +83,7 @@ def _raw_header(path: Path) -> tuple[str, tuple[int, int] | None, bool, str, int
 
 
 def _triggers(path: Path, version: str, start: int) -> Triggers | None:
-    """version: "2", "3", or of another format, which has none."""
+    """version: "2" or "3"; of any other no triggers are read."""
     if version not in DECODERS:
         return None
     decode, state, kind = DECODERS[version]
@@ -101,7 +102,7 @@ def _triggers(path: Path, version: str, start: int) -> Triggers | None:
 
 @contextmanager
 def _guarded(path: Path):
-    """What faery raises becomes a RecordingError; its panics are no Exceptions."""
+    """Turns what faery raises into a RecordingError; a panic of its Rust code is no Exception."""
     try:
         yield
     except BaseException as error:

@@ -4,7 +4,7 @@
 % Width 304
 1 byte type           0x00 (2d) or 0x0C (contrast detection): events, in the same layout
 1 byte size           8
-uint32                time, microseconds; starts again from 0 after 71.6 minutes
+uint32                time, microseconds; wraps around to 0 after 71.6 minutes
 uint32                version 2: x bits 0-13, y bits 14-27, polarity bit 28
                       version 1: x bits 0-8,  y bits 9-16,  polarity bit 17
 """
@@ -61,7 +61,8 @@ def read(path: Path) -> Source:
 
 
 def read_header(file: BufferedReader) -> str:
-    """The lines that start with %, up to `% end` if there is one; leaves the file behind them."""
+    """The lines that start with %, up to `% end` if there is one; leaves the file at the byte after
+    them."""
     header = ""
     while file.peek(1)[:1] == b"%":
         line = file.readline(1 << 16).decode("latin-1")

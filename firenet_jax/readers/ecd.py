@@ -57,7 +57,7 @@ def _folder_in(path: Path) -> str | None:
 
 
 def _bytes(path: Path, name: str) -> bytes:
-    """Of a list or a picture: neither is so large that it would have to be read in parts."""
+    """All of images.txt or of a picture, at once: raises RecordingError beyond MAX_BYTES."""
     inside = open(path / name, "rb") if path.is_dir() else None
     with inside or text.opened(path, f"{_folder_in(path)}{name}") as stream:
         content = stream.read(MAX_BYTES + 1)
@@ -86,7 +86,9 @@ def _frames(path: Path) -> Frames | None:
                 "and the name of a picture are expected"
             )
         if PurePath(name).is_absolute() or ".." in PurePath(name).parts:
-            raise RecordingError(f"{path}, images.txt, line {number}: {name!r} lies elsewhere")
+            raise RecordingError(
+                f"{path}, images.txt, line {number}: {name!r} lies outside the recording"
+            )
         if "\0" in name:
             raise RecordingError(
                 f"{path}, images.txt, line {number}: {name!r} is no name of a file"

@@ -1,8 +1,8 @@
 """EVT2 words -> edges at the trigger inputs: the plain stream of Prophesee's sensors, 32 bits each.
 
 bits 31-28   bits 27-0
-0x0, 0x1  event      low time (bits 27-22), x (21-11), y (10-0); events are faery's business
-0x8  time high       bits 33-6 of the time, microseconds, which starts again after 4.8 hours
+0x0, 0x1  event      low time (bits 27-22), x (21-11), y (10-0); not read here, but by faery
+0x8  time high       bits 33-6 of the time, microseconds, which wraps around after 4.8 hours
 0xA  trigger         low time (bits 27-22), input (12-8), edge (bit 0): 1 rises
 others               vendor's data
 """
@@ -13,8 +13,9 @@ from firenet_jax.readers import unwrap
 
 
 def triggers(high: int, words: np.ndarray) -> tuple[int, tuple[np.ndarray, ...]]:
-    """The high time so far, -1 where it is not known yet, (N,) uint32 -> the high time behind them,
-    (times, ids, polarity): int64 microseconds, input, 0 or 1. Edges before it are left out."""
+    """The time high so far, -1 where it is not known yet, (N,) uint32 -> the time high after them,
+    (times, ids, polarity), int64: microseconds, input, 0 or 1. Edges before the first time high are
+    left out."""
     kind, load = words >> 28, (words & 0xFFFFFFF).astype(np.int64)
     is_high = kind == 0x8
     highs = np.append(high, unwrap(load[is_high], 28, max(high, 0)))

@@ -7,12 +7,13 @@
     0x4  vector of 12   bit i: an event at base + i; then the base moves on by 12
     0x5  vector of 8    bit i: an event at base + i; then the base moves on by 8
     0x6  time low       bits 11-0 of the time, microseconds
-    0x8  time high      bits 23-12 of the time, which starts again from 0 after 16.8 s
+    0x8  time high      bits 23-12 of the time, which wraps around to 0 after 16.8 s
     0xA  trigger        input (bits 11-8), edge (bit 0): 1 rises
     others              vendor's data: no events
 
 A word changes what it names and leaves the rest, so a stream that comes in pieces needs the state
-between them. "The last such word before this one" is an index: the running count of such words.
+between them. There is no loop over words: the running count of the words of a kind (cumsum) is, at
+each word, the index of the last one so far.
 """
 
 from typing import NamedTuple
@@ -21,8 +22,9 @@ import numpy as np
 
 from firenet_jax.readers import unwrap
 
-# Sensors fall back to a slightly older time now and then. Up to ten high parts are evened out: that
-# the ROS driver's own decoder takes for no restart either. More is damage, and stays.
+# Sensors fall back to a slightly older time now and then. Falls of up to ten steps of time high are
+# raised to the latest time; the ROS driver's decoder does not take those for a wrap-around either.
+# Larger ones are damage, and stay for `events.checked` to judge.
 JITTER = 10 << 12  # microseconds
 
 
@@ -30,15 +32,15 @@ class State(NamedTuple):
     """What a piece leaves to the next one; -1: not known yet."""
 
     time: int = -1  # microseconds, unwrapped
-    latest: int = -1  # of all events
-    high: int = -1  # its part above 12 bits, unwrapped
+    latest: int = -1  # the largest time of all events
+    high: int = -1  # the last time high, unwrapped
     y: int = -1
     base: int = -1  # column of the next vector's bit 0
     base_on: int = 0  # polarity of the next vector
 
 
 def decode(state: State, words: np.ndarray) -> tuple[State, tuple[np.ndarray, ...]]:
-    """(N,) uint16 -> state behind them, (t, x, y, p): int64 microseconds, column, row, 0 or 1.
+    """(N,) uint16 -> state after them, (t, x, y, p): int64 microseconds, column, row, 0 or 1.
 
     Events before the first complete time, row or base are left out: their place is unknown.
     """
@@ -77,7 +79,7 @@ def decode(state: State, words: np.ndarray) -> tuple[State, tuple[np.ndarray, ..
 
 
 def triggers(state: State, words: np.ndarray) -> tuple[State, tuple[np.ndarray, ...]]:
-    """(N,) uint16 -> state behind them, of which only the time counts, (times, ids, polarity) of
+    """(N,) uint16 -> state after them, of which only the time counts, (times, ids, polarity) of
     the edges at the trigger inputs: int64 microseconds, input, 0 or 1. Edges before the first
     complete time are left out."""
     kind, load = words >> 12, (words & 0xFFF).astype(np.int64)
@@ -88,15 +90,16 @@ def triggers(state: State, words: np.ndarray) -> tuple[State, tuple[np.ndarray, 
 
 
 def _times(state: State, kind: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """-> the time at every word, the times one after the other, the last high part"""
+    """-> the time at every word, -1 before the first; all times in order, from that of `state` on;
+    the last time high, unwrapped"""
     clock = np.flatnonzero((kind == 0x6) | (kind == 0x8))
     is_high = kind[clock] == 0x8
     highs = load[clock[is_high]]
     highs = np.append(state.high, unwrap(highs, 12, max(state.high, 0)))
     now = np.cumsum(is_high)
     high = highs[now]
-    # The low part starts again from 0 where the high part moves on; a repetition changes nothing.
-    # The first high part of all tells no time before its low part comes.
+    # Time low is 0 where time high moves on; a repetition of time high changes nothing. The first
+    # time high of all tells no time before a time low comes.
     moves = is_high & (high != highs[np.maximum(now - 1, 0)]) & (now > (state.high < 0))
     says = moves | ~is_high & (high >= 0)
     told = (high << 12) + np.where(is_high, 0, load[clock])

@@ -65,15 +65,15 @@ def read(path: Path) -> Source:
             size = int(match[2]), int(match[1])
     if size is None and frames is not None:
         size = frames.read(0).shape
-    grey = layout == "Metavision"  # Prophesee's, of which none sees colours
+    grey = layout == "Metavision"  # Prophesee's sensors are monochrome
     return Source(f"HDF5 ({layout})", lambda: _events(path, layout), size, count, frames, grey)
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """The file, as h5py opens it: to a type checker any, for a name may hold anything.
+    """The file, as h5py opens it; typed Any, for a name may hold a group or a data set.
 
-    Whatever goes wrong with the file raises RecordingError: damaged bytes, and groups or text where
+    Any exception while it is open becomes a RecordingError: damaged bytes, and groups or text where
     numbers are expected, raise every kind.
     """
     check_readable(path, RecordingError)
@@ -93,7 +93,7 @@ def _layout(path: Path, file: Any) -> str:
         return "v2e"
     if METAVISION in file:
         return "Metavision"
-    found = list(map(str, file))  # names that are no text are bytes
+    found = list(map(str, file))  # names that are not UTF-8 are bytes
     if isinstance(events, h5py.Group):
         found += [f"events/{name}" for name in events]
     raise RecordingError(
@@ -153,10 +153,12 @@ def _reader(path: Path, file: Any, layout: str) -> tuple[Read, int]:
 
 
 def _check_stored(path: Path, data: Any):
-    """Data of other files is not read: a stranger would choose which. Compression that h5py lacks
-    comes with hdf5plugin, which adds it when imported."""
+    """Refuses data that lies in other files: whoever made this file would choose which are read.
+    Imports hdf5plugin, which registers further compressions, where h5py alone lacks one."""
     if data.external:
-        raise RecordingError(f"{path}: {data.name} is stored in other files: ask for one with all")
+        raise RecordingError(
+            f"{path}: {data.name} is stored in other files: use a file that holds all its data"
+        )
     created = data.id.get_create_plist()
     for number in (created.get_filter(i)[0] for i in range(created.get_nfilters())):
         if not h5py.h5z.filter_avail(number):

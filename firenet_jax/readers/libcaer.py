@@ -11,8 +11,8 @@ libcaer_cmp    16 bits a word, much as EVT3 with rows and columns exchanged:
     4  vector base  polarity (bit 11), y (bits 10-0) of the vectors that follow
     5  vector of 8  bit i: an event at base + i; then the base moves on by 8
 
-Times are counted from the time_base of their message, where those of libcaer_cmp start from 0. So
-does event_camera_codecs decode them.
+Times are relative to the time_base of their message; in libcaer_cmp time high and time low are 0 at
+the beginning of each message. event_camera_codecs decodes them in the same way.
 """
 
 from typing import NamedTuple
@@ -35,9 +35,11 @@ class State(NamedTuple):
 def decode(
     state: State, words: np.ndarray, starts: np.ndarray, time_bases: np.ndarray
 ) -> tuple[State, tuple[np.ndarray, ...]]:
-    """Messages of libcaer_cmp, one behind the other: (N,) uint16, (M,) the first word of each
-    message, (M,) int64 microseconds -> state behind them, (t, x, y, p): int64 microseconds, column,
-    row, 0 or 1. Events before the first column or base are left out: their place is unknown."""
+    """M messages of libcaer_cmp -> state after them, (t, x, y, p): int64 microseconds, column, row,
+    0 or 1. Events before the first column or base are left out: their place is unknown.
+
+    words: (N,) uint16 of all messages; starts: (M,) index of each message's first word;
+    time_bases: (M,) int64 microseconds."""
     kind, load = words >> 12, (words & 0xFFF).astype(np.int64)
     place = np.arange(len(words))
     message = np.searchsorted(starts, place, side="right") - 1

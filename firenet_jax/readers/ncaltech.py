@@ -5,8 +5,8 @@
     byte 2      bit 7: polarity, 1 is ON; bits 6 to 0: bits 22 to 16 of the time
     bytes 3, 4  bits 15 to 0 of the time, microseconds
 
-Row 240 lies below the sensor (ATIS, 304x240): such an entry is no event but a mark of the clock,
-behind which all times move on by 2^13 microseconds; so does the reader of the data set's author.
+Row 240 lies below the sensor (ATIS, 304x240): such an entry is no event but an overflow of the
+timer, which adds 2^13 microseconds to its own time and all later ones, as in the data set's reader.
 The file names no sensor size.
 """
 
@@ -19,8 +19,8 @@ from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Rows
 from firenet_jax.readers import CHUNK, Source, to_events
 
-MARK = 240
-STEP = 2**13
+OVERFLOW_ROW = 240
+OVERFLOW = 2**13  # microseconds
 
 
 def matches(path: Path) -> bool:
@@ -29,20 +29,20 @@ def matches(path: Path) -> bool:
 
 def read(path: Path) -> Source:
     size = path.stat().st_size
-    return Source("N-Caltech101", lambda: _events(path, size), grey=True)  # of an ATIS
+    return Source("N-Caltech101", lambda: _events(path, size), grey=True)  # an ATIS
 
 
 def _events(path: Path, size: int) -> Iterator[Events | Rows]:
-    row, marks = 0, 0
+    row, overflows = 0, 0
     with open(path, "rb") as file:
         # Not to the end: a file that is still being written may end within an event by now.
         while data := file.read(min(5 * CHUNK, size - size % 5 - file.tell())):
             x, y, high, middle, low = np.frombuffer(data, np.uint8).reshape(-1, 5).T
             t = (high & 0x7F).astype(np.int64) << 16 | middle.astype(np.int64) << 8 | low
-            is_mark = y == MARK
-            t += STEP * (marks + np.cumsum(is_mark))
-            marks += int(is_mark.sum())
-            columns = (column[~is_mark] for column in (t, x, y, high >> 7))
+            is_overflow = y == OVERFLOW_ROW
+            t += OVERFLOW * (overflows + np.cumsum(is_overflow))
+            overflows += int(is_overflow.sum())
+            columns = (column[~is_overflow] for column in (t, x, y, high >> 7))
             events = to_events(path, row, *columns)
             row += len(events)
             yield events

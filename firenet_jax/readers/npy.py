@@ -11,7 +11,7 @@
     one file: rows (N, 4) of t, x, y, p; a structured array with fields of these names (or ts, xs,
     ys, ps and the like); or, of an .npz, four arrays of these names. Times as above; no size.
 
-The files are mapped, not read, and sliced as the events are asked for; but an .npz is read whole.
+The files are memory-mapped and sliced as the events are asked for; but an .npz is read whole.
 """
 
 import json
@@ -39,7 +39,6 @@ FILES = {
     "event_cnn_minimal": ("t.npy", "xy.npy", "p.npy", "timestamps.npy"),
 }
 
-
 NPZ = 1 << 34  # bytes of all arrays in an .npz, at most
 
 
@@ -61,7 +60,9 @@ def read(path: Path, columns: str | None = None) -> Source:
             count=count,
         )
     if columns is not None:
-        raise RecordingError(f"{path}: has its columns in files of their own: they have no order")
+        raise RecordingError(
+            f"{path}: has a file for each column, and so no order of columns: leave out --columns"
+        )
     t, _, _ = _columns(path, layout)
     frames = _frames(path, layout)
     size = _size(path)
@@ -93,7 +94,7 @@ def _columns(path: Path, layout: str) -> list[np.ndarray]:
 def _order(path: Path, columns: str) -> list[str]:
     named = [word.strip().lower() for word in columns.split(",")]
     if sorted(named) != sorted("txyp"):
-        raise RecordingError(f"{path}: columns are {columns!r}, expected an order as x,y,p,t")
+        raise RecordingError(f"{path}: columns are {columns!r}, expected an order such as x,y,p,t")
     return named
 
 

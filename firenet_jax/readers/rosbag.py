@@ -9,10 +9,11 @@
         mono    64 bits: nanoseconds after time_base (bits 0-31), x (32-47), y (48-62), polarity
     sensor_msgs/Image               frames: mono8, rgb8, bgr8, mono16
 
-A folder's metadata.yaml may name no storage: then its files are read for what they are.
+Where a folder's metadata.yaml does not name the storage, its .mcap and .db3 files are opened one by
+one.
 
 Times are microseconds of the ROS clock. EventPackets carry the sensor's own clock: the first event
-is put at the time in its message's header, so events and frames agree but for the transport.
+is put at the time in its message's header, so events and frames agree up to the transport's delay.
 Messages are decoded from their bytes: ROS 1 packs fields, ROS 2 (CDR) aligns each to its size.
 """
 
@@ -47,6 +48,7 @@ ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
 IMAGE = "sensor_msgs/msg/Image"
 WORDS = 1 << 18  # words of 16 bits decoded at once: messages are tiny
+# Readers of files whose index is missing or damaged.
 TORN = {".bag": torn_bag.Torn, ".mcap": torn_mcap.Torn}
 ORDERS: dict[str, Literal["little", "big"]] = {"<": "little", ">": "big"}
 CHANNELS = {"mono8": 1, "8UC1": 1, "mono16": 1, "16UC1": 1, "rgb8": 3, "bgr8": 3}
@@ -67,9 +69,9 @@ def read(path: Path) -> Source:
         size = None if first is None else _size(_Message(first, ros2))
         grey = False
         if first is not None and topics[topic] in PACKETS:
-            grey = _packet(_Message(first, ros2)).encoding == "evt3"  # Prophesee's
+            grey = _packet(_Message(first, ros2)).encoding == "evt3"  # Prophesee: monochrome
         images = [t for t, kind in topics.items() if kind == IMAGE]
-        # Of several cameras' images, those of the same name: /dvs/events, /dvs/image_raw.
+        # Of several cameras' images, those whose topic begins alike: /dvs/events, /dvs/image_raw.
         image_topic = max(images, key=lambda name: len(commonprefix([name, topic])), default=None)
         frames = _frames(path, bag, image_topic)
     return Source(
@@ -89,20 +91,20 @@ def _is_ros1(path: Path) -> bool:
 @contextmanager
 def _bag(path: Path):
     """The bag; one that cannot be opened is read without its index, as far as it goes."""
-    with contextlib.ExitStack() as opened:
-        yield _opened(path, opened)
+    with contextlib.ExitStack() as stack:
+        yield _opened(path, stack)
 
 
-def _opened(path: Path, opened: contextlib.ExitStack):
-    """What is open until `opened` is closed."""
+def _opened(path: Path, stack: contextlib.ExitStack):
+    """A reader, whose files are open until `stack` is closed."""
     library = extra("rosbags.rosbag1" if _is_ros1(path) else "rosbags.rosbag2", path)
     try:
-        return opened.enter_context(library.Reader(path))
-    except Exception:  # damaged bytes reach every kind
+        return stack.enter_context(library.Reader(path))
+    except Exception:  # damaged bytes raise every kind
         bag = None
         if path.is_dir():
             if files := _files(path):
-                bag = _Files([_opened(file, opened) for file in files])
+                bag = _Files([_opened(file, stack) for file in files])
         elif path.suffix.lower() in TORN:
             bag = TORN[path.suffix.lower()](path)
         if bag is None or not bag.connections:
@@ -111,7 +113,8 @@ def _opened(path: Path, opened: contextlib.ExitStack):
 
 
 def _files(path: Path) -> list[Path]:
-    """The files that a folder's metadata.yaml names, in its order, or all; none where one lacks."""
+    """The files that a folder's metadata.yaml names, in its order, or all if it names none; no file
+    if one is missing."""
     text = (path / "metadata.yaml").read_bytes().decode("utf-8", "replace")
     names = dict.fromkeys(re.findall(r"[^\s/'\"]+\.(?:mcap|db3)\b", text))
     files = [path / name for name in names] or sorted(
@@ -138,6 +141,8 @@ class _Files:
 
 
 def _only(path: Path, found: list[str], topics: dict[str, str]) -> str:
+    """The first of the topics with events; a warning says so if there are several. topics: of all
+    kinds, name to type, for the error if there is none."""
     if not found:
         listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items()))
         raise RecordingError(
@@ -150,7 +155,7 @@ def _only(path: Path, found: list[str], topics: dict[str, str]) -> str:
 
 
 def _in_a_line(text: str) -> str:
-    """What damage makes of a name may break lines."""
+    """Replaces what cannot be printed: in a damaged name there may be line breaks."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
@@ -166,10 +171,11 @@ class _Message:
 
     def __init__(self, raw: bytes, ros2: bool):
         self.raw, self.ros2 = raw, ros2
-        self.at = self.start = 4 if self.ros2 else 0  # CDR tells its byte order first
+        self.at = self.start = 4 if self.ros2 else 0  # CDR's header, with the byte order
         self.order = ">" if self.ros2 and raw[1] == 0 else "<"
 
     def number(self, size: int) -> int:
+        """The next unsigned integer, of so many bytes."""
         if self.ros2:
             self.at += -(self.at - self.start) % size
         self.at += size
@@ -201,6 +207,7 @@ def _microseconds(seconds, nanoseconds):
 
 
 def _size(message: _Message) -> tuple[int, int]:
+    """(height, width)"""
     message.header()
     return message.number(4), message.number(4)
 
@@ -216,15 +223,15 @@ def _events(path: Path, topic: str, arrays: bool) -> Iterator[Events | Rows]:
 
 
 def _placed(path: Path, messages: Iterator[tuple[int, bytes]]) -> Iterator[bytes]:
-    """The bytes of messages. sqlite leaves no place in its file that tells how far it has come
-    (`storage.progress`), so a file that we open stands there."""
+    """The bytes of messages. `storage.progress` follows the positions of open files, but SQLite
+    leaves none that tells how much it has read: a file handle of our own moves in its stead."""
     largest = max(_files(path) if path.is_dir() else [path], key=lambda file: file.stat().st_size)
     if largest.suffix.lower() != ".db3":
         yield from (raw for _, raw in messages)
         return
-    with open(largest, "rb", buffering=0) as place:
+    with open(largest, "rb", buffering=0) as handle:
         for _, raw in messages:
-            place.seek(min(place.tell() + len(raw), largest.stat().st_size))
+            handle.seek(min(handle.tell() + len(raw), largest.stat().st_size))
             yield raw
 
 
@@ -236,8 +243,8 @@ def _array_columns(messages: Iterator[_Message]) -> Iterator[tuple[np.ndarray, .
             continue
         data, offsets, size = message.raw[message.at :], (0, 2, 4, 8, 12), 13
         if message.ros2:
-            # x and y are aligned to 2, the time to 4: two bytes of nothing lie before the time of
-            # every event but the first, and one behind the polarity of every event but the last.
+            # x and y are aligned to 2, the time to 4: two bytes of padding lie before the time of
+            # every event but the first, and one after the polarity of every event but the last.
             data, offsets, size = b"%b\0\0%b\0" % (data[:4], data[4:]), (0, 2, 6, 10, 14), 16
         formats = [message.order + kind for kind in ("u2", "u2", "u4", "u4", "u1")]
         event = np.dtype(
@@ -252,7 +259,7 @@ class _Packet(NamedTuple):
     stamp: int  # microseconds
     time_base: int  # nanoseconds
     encoding: str
-    words: str  # order of their bytes, as numpy writes it
+    words: str  # byte order of the payload's words, as numpy writes it
     payload: bytes
 
 
@@ -289,7 +296,7 @@ def _mono(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, .
 
 
 def _evt3(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, ...]]]:
-    """Alone until the first event is known, whose stamp counts; then many messages at once."""
+    """Message by message up to the first event, whose stamp counts; then many at once."""
     state, waiting, started, order = evt3.State(), bytearray(), False, "<"
     damage = None
     try:
@@ -301,7 +308,7 @@ def _evt3(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, .
             state, columns = evt3.decode(state, np.frombuffer(bytes(waiting), order + "u2"))
             waiting, started = bytearray(), started or len(columns[0]) > 0
             yield packet.stamp, columns
-    except Exception as error:  # whatever a library says of damage: after what came before it
+    except Exception as error:  # damage, of any kind: raised below, after what precedes it
         damage = error
     yield 0, evt3.decode(state, np.frombuffer(bytes(waiting), order + "u2"))[1]
     if damage is not None:
@@ -309,7 +316,7 @@ def _evt3(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, .
 
 
 def _libcaer_cmp(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, ...]]]:
-    """Alone until the first event is known, whose stamp counts; then many messages at once."""
+    """Message by message up to the first event, whose stamp counts; then many at once."""
     state, waiting, count, started = libcaer.State(), [], 0, False
     damage = None
 
@@ -328,7 +335,7 @@ def _libcaer_cmp(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.nda
             state, columns = decode()
             waiting, count, started = [], 0, started or len(columns[0]) > 0
             yield packet.stamp, columns
-    except Exception as error:  # whatever a library says of damage: after what came before it
+    except Exception as error:  # damage, of any kind: raised below, after what precedes it
         damage = error
     if waiting:
         yield 0, decode()[1]
@@ -343,7 +350,7 @@ def _libcaer(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray
 
 
 def _to_microseconds(nanoseconds: int) -> int:
-    """Raises ValueError for what is no time: it has 64 bits."""
+    """Raises ValueError where int64 is too small, as after damage."""
     if nanoseconds >= 1 << 63:
         raise ValueError(f"a message starts at {nanoseconds} ns")
     return (nanoseconds + 500) // 1000
@@ -353,11 +360,11 @@ DECODERS = {"evt3": _evt3, "libcaer": _libcaer, "libcaer_cmp": _libcaer_cmp, "mo
 
 
 def _triggers(path: Path, topic: str) -> Triggers | None:
-    """Edges among the words of EVT3, moved as the events are."""
+    """Edges among the words of EVT3, moved to the ROS clock as the events are."""
 
     def pieces():
         state, ahead, shift, waiting, found = evt3.State(), evt3.State(), None, bytearray(), []
-        with contextlib.suppress(Exception), _bag(path) as bag:  # events will say so
+        with contextlib.suppress(Exception), _bag(path) as bag:  # events raise it
             for _, raw in _raw(bag, topic):
                 packet = _packet(_Message(raw, not _is_ros1(path)))
                 if packet.encoding != "evt3":
@@ -390,7 +397,7 @@ def _frames(path: Path, bag, topic: str | None) -> Frames | None:
                 logger.warning("%s: images of %s are %s: no frames", path, topic, encoding)
                 return None
             recorded.append(time)
-    except Exception as error:  # damaged bytes reach every kind; of a torn bag, events will say so
+    except Exception as error:  # damaged bytes raise every kind; a torn bag's events raise it, too
         if not isinstance(bag, tuple(TORN.values())):
             found = " ".join(str(error).split())
             logger.warning("%s: reads %d images of %s (%s)", path, len(recorded), topic, found)

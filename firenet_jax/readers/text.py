@@ -7,10 +7,10 @@ Separators are spaces, tabs or commas. Times are seconds; where none of the firs
 point they are microseconds, and a notice says so. A line of names (`x,y,p,t`, any order, further
 columns are skipped) sets the order of the columns and, where it tells one (`t_us`, `time [ns]`),
 the unit of the times; Metavision's `%geometry:1280,720` sets the size and that program's own order.
-Lines are counted from 1, header included; empty lines do not matter.
+Lines are counted from 1, header and empty ones included.
 
-Blocks of 2 MB go through pyarrow's parser, which is half of the time of a zip; only a block that it
-refuses is read again in Python, to name the line.
+Blocks of 2 MB go through pyarrow's parser, which takes half of the time that a zip takes; only a
+block that it refuses is read again in Python, to name the line.
 """
 
 import gzip
@@ -34,8 +34,8 @@ from firenet_jax.readers import Source, reading, to_events
 from firenet_jax.settings import LONGEST_SIDE
 
 BLOCK = 1 << 21  # bytes parsed at once: about 90,000 events
-HEAD = 1 << 16  # bytes from which the layout is told
-SNIFFED = 1000  # rows from which the units are told
+HEAD = 1 << 16  # bytes from which the layout is inferred
+SNIFFED = 1000  # rows from which units and the order of columns are inferred
 BROKEN = zipfile.BadZipFile, zlib.error, EOFError, OSError  # what damaged compressed bytes raise
 
 NAMES = {
@@ -44,7 +44,7 @@ NAMES = {
     "y": ("y", "ys"),
     "p": ("p", "ps", "pol", "polarity", "on"),
 }
-UNITS = {  # microseconds
+UNITS = {  # microseconds in a unit: its names
     1e6: ("s", "sec", "secs", "second", "seconds"),
     1e3: ("ms", "msec", "millisecond", "milliseconds"),
     1.0: ("us", "usec", "µs", "μs", "microsecond", "microseconds"),
@@ -80,7 +80,7 @@ def read(path: Path, member: str | None = None, columns: str | None = None) -> S
     if path.suffix.lower() == ".zip" and member is None:
         member = _only_text(path)
     if columns is not None and _names(columns.lower()) is None:
-        raise RecordingError(f"{path}: columns are {columns!r}, expected an order as x,y,p,t")
+        raise RecordingError(f"{path}: columns are {columns!r}, expected an order such as x,y,p,t")
     layout = _sniff(path, member, columns)
     return Source(
         format="text" if member is None else "zipped text",
@@ -92,7 +92,8 @@ def read(path: Path, member: str | None = None, columns: str | None = None) -> S
 
 @contextmanager
 def opened(path: Path, member: str | None = None) -> Iterator[Any]:
-    """A file, or a file in a zip -> stream of its bytes; damage raises RecordingError."""
+    """A file, perhaps gzipped, or a file in a zip -> stream of its bytes; damage, while it is open,
+    raises RecordingError."""
     with reading(path, *BROKEN), ExitStack() as stack:
         if member is not None:
             with reading(path, Exception):  # a damaged list of members raises every kind
@@ -106,7 +107,7 @@ def opened(path: Path, member: str | None = None) -> Iterator[Any]:
 
 
 def members(path: Path) -> list[str]:
-    """The names of the files in a zip."""
+    """The names of the files in a zip. Raises RecordingError where it is damaged."""
     with reading(path, Exception), zipfile.ZipFile(path) as archive:
         names = [info.filename for info in archive.infolist() if not info.is_dir()]
     return [name for name in names if not name.startswith("__MACOSX/")]
@@ -182,7 +183,7 @@ def _sniff(path: Path, member: str | None, columns: str | None = None) -> Layout
 
 
 def _names(line: str) -> tuple[tuple[str, ...], float | None] | None:
-    """A line of names -> the columns' own names here, and the unit of the times if it is told.
+    """A line of names -> those of `Layout`, and the unit of the times, in microseconds, if told.
 
     None if t, x, y, p are not all among them.
     """
@@ -209,15 +210,16 @@ def _names(line: str) -> tuple[tuple[str, ...], float | None] | None:
 
 
 def _other_order(rows: list[list[str]]) -> str | None:
-    """ "x,y,p,t" where these rows can only be so: one column alone grows, and goes beyond pixels or
-    has fractions; one alone is 0 and 1 (or -1 and 1); and they are not where they should be."""
+    """As `other_order`, of the words of rows."""
     if len(rows) < 5 or any(len(row) != 4 or not all(map(_is_number, row)) for row in rows):
         return None
     return other_order(np.array([[float(word) for word in row] for row in rows]).T)
 
 
 def other_order(columns: np.ndarray) -> str | None:
-    """The same of numbers (4, N)."""
+    """(4, N) numbers -> "x,y,p,t", say, where no other order is possible: one column alone never
+    falls, and exceeds coordinates or has fractions; one alone is 0 and 1 (or -1 and 1). None where
+    that is unclear, or the order is t, x, y, p."""
     signs = [set(column.tolist()) in ({0, 1}, {-1, 1}) for column in columns]
     times = [
         (np.diff(column) >= 0).all()
@@ -241,7 +243,7 @@ def _is_number(word: str) -> bool:
         float(word)
     except ValueError:
         return False
-    return word.isascii() and "_" not in word  # as Python's own numbers need not be
+    return word.isascii() and "_" not in word  # float() takes other digits and 1_000, too
 
 
 def _words(line: str, separator: str) -> list[str]:
@@ -249,7 +251,7 @@ def _words(line: str, separator: str) -> list[str]:
 
 
 def _pieces(stream: Any, size: int) -> Iterator[bytes]:
-    """So many bytes at a time; what comes before damage comes before its error."""
+    """So many bytes at a time. An error of `BROKEN` is raised after the bytes that precede it."""
     error, found = None, b"."
     while found:
         pieces, missing = [], size
@@ -323,7 +325,7 @@ def _scaled(t: np.ndarray, unit: float | None) -> np.ndarray:
 def _table(block: bytes, layout: Layout) -> pa.Table:
     return pyarrow.csv.read_csv(
         pa.BufferReader(block),
-        # One thread: the device needs the cores, and what two threads hold at once is up to chance.
+        # One thread: the device needs the cores, and the memory that two threads need varies.
         pyarrow.csv.ReadOptions(column_names=layout.names, use_threads=False),
         pyarrow.csv.ParseOptions(delimiter=layout.separator, quote_char=False),
         pyarrow.csv.ConvertOptions(
@@ -344,12 +346,12 @@ def _tidied(block: bytes, separator: str) -> bytes:
 def _sorted_out(
     path: Path, number: int, block: bytes, layout: Layout, place: Callable[[int], str]
 ) -> Rows:
-    """A block with lines that are no events, line by line, in Python's time."""
-    good, bad, said = [], [], ""
+    """A block with lines that are no events -> Rows, line by line in Python, which is slow."""
+    good, bad, first_fault = [], [], ""
     for line in filter(None, map(str.strip, block.decode("utf-8", "replace").split("\n"))):
         fault = _fault(line, layout)
-        if fault and not said:
-            said = f"{path}, {place(len(bad))}: {fault}"
+        if fault and not first_fault:
+            first_fault = f"{path}, {place(len(bad))}: {fault}"
         bad.append(bool(fault))
         good += [] if fault else [line]
     columns = [[]] * 4
@@ -357,26 +359,26 @@ def _sorted_out(
         if good:
             rows = _tidied("\n".join(good).encode(), layout.separator)
             columns = _columns(_table(rows, layout), layout)
-        if not said or len(columns[0]) != len(good):
-            raise pa.ArrowInvalid("rows that only a person can tell apart")
+        if not first_fault or len(columns[0]) != len(good):
+            raise pa.ArrowInvalid("the parser refuses lines that look right")
     except pa.ArrowInvalid as error:
         raise RecordingError(
             f"{path}, in the lines from {number}: not rows of t x y p ({_shown(str(error))})"
         ) from error
     bad = np.array(bad)
     everything = []
-    for column in map(np.asarray, columns):  # rows that are none are zero
+    for column in map(np.asarray, columns):  # bad rows are zero
         everything.append(np.zeros(len(bad), column.dtype))
         everything[-1][~bad] = column
     rest = to_events(path, 0, *everything, place=place)
     if isinstance(rest, Events):
-        return Rows(rest, bad, RecordingError(said))
+        return Rows(rest, bad, RecordingError(first_fault))
     earlier = np.argmax(rest.bad) < np.argmax(bad)
-    return Rows(rest.events, bad | rest.bad, rest.error if earlier else RecordingError(said))
+    return Rows(rest.events, bad | rest.bad, rest.error if earlier else RecordingError(first_fault))
 
 
 def _fault(line: str, layout: Layout) -> str:
-    """What is wrong with a line; nothing where it is an event."""
+    """What is wrong with a line; empty where it is an event."""
     words, columns = _words(line, layout.separator), len(layout.names)
     if len(words) != columns:
         return f"{_count(len(words))} instead of {_count(columns, '')}: {_shown(line)}"

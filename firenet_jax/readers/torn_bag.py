@@ -30,7 +30,7 @@ class Connection(NamedTuple):
 
 
 class Torn:
-    """What a reader of rosbags offers, as far as it is used here; of MCAP too (`torn_mcap`)."""
+    """Stands in for rosbags' Reader, as far as that is used here; `torn_mcap` has one of MCAP."""
 
     magic, format = MAGIC, "bag"  # the first bytes; what such a file is called
 
@@ -38,7 +38,7 @@ class Torn:
         self.path = path
         self.known: dict[int, Connection] = {}
         self.ended: Exception | None = None
-        for _ in self._messages():  # connections are told before their first message
+        for _ in self._messages():  # fills `known`: connections stand among the messages
             pass
 
     def __enter__(self):
@@ -53,7 +53,7 @@ class Torn:
 
     def messages(self, connections, start: int | None = None) -> Iterator[tuple]:
         """(connection, time of recording in ns, bytes), not before `start`. Raises ValueError at
-        the end: a file without an index was not closed."""
+        the end, always: a file without an index was not closed."""
         for connection, time, data in self._messages():
             if connection in connections and time >= (start or 0):
                 yield connection, time, data

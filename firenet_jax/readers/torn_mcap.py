@@ -3,11 +3,13 @@
 The file is 8 bytes that name the format, then records: a byte that says what it holds, uint64 size.
 Texts have their uint32 size before them (MCAP's specification, version 0).
 
-    3  schema: uint16 number, name, and what is not read      4  channel: uint16 number, uint16
-    5  message: uint16 channel, uint32 number, uint64 time       schema, topic, encoding
-       of recording in ns, uint64 time of publishing, data    6  chunk: further records: 3 uint64,
-    others  indexes and statistics, which are not read           uint32 checksum, compression (none,
-                                                                 lz4, zstd), uint64 size
+    3  schema: uint16 number, name, and what is not read
+    4  channel: uint16 number, uint16 schema, topic, encoding
+    5  message: uint16 channel, uint32 number, uint64 time of recording in ns, uint64 time of
+       publishing, data
+    6  chunk: uint64 first time, last time and unpacked size, uint32 checksum, compression ("", lz4,
+       zstd), uint64 size, so many bytes: further records, compressed as a whole
+    others  indexes and statistics, which are not read
 """
 
 import io
@@ -24,7 +26,7 @@ from firenet_jax.readers.torn_bag import LARGEST, Connection
 
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK = 3, 4, 5, 6
-FARTHEST = 1 << 62  # bytes that can be passed over
+FARTHEST = 1 << 62  # bytes that can be skipped
 
 
 class Torn(torn_bag.Torn):
@@ -41,7 +43,7 @@ class Torn(torn_bag.Torn):
             kind, size = struct.unpack("<BQ", head)
             if kind not in (SCHEMA, CHANNEL, MESSAGE, CHUNK):
                 if size >= FARTHEST:
-                    raise ValueError("a record that goes on behind the end")
+                    raise ValueError("a record that goes on past the end")
                 file.seek(size, io.SEEK_CUR)
                 continue
             data = file.read(size) if size <= LARGEST else b""
@@ -75,7 +77,7 @@ class Torn(torn_bag.Torn):
 
 
 def _text(data: bytes, at: int) -> tuple[str, int]:
-    """(a text, the place behind it)"""
+    """(a text, the offset after it)"""
     size = struct.unpack_from("<I", data, at)[0]
     return data[at + 4 : at + 4 + size].decode(), at + 4 + size
 

@@ -1,8 +1,8 @@
-"""Images -> one HDF5 file, for people who compute: float32 as the network gives them.
+"""Images -> one HDF5 file, for further computation: float32 as the network gives them.
 
     images   (N, H, W) float32, nominally 0 to 1 and not clipped
     times    (N,) int64, microseconds on the recording's clock
-    events   (N,) int64, how many events the image is of
+    events   (N,) int64, number of events that the image is made of
 
 It is written beside its final name and renamed when it is whole.
 """
@@ -19,13 +19,16 @@ from firenet_jax.storage.files import lock_file, partial_name, writing
 
 
 class ArraysWriter:
-    """As `video.VideoWriter`, of images (H, W) float32, all of one size."""
+    """Used as `video.VideoWriter`, for images (H, W) float32, all of one size.
+
+    All but `abandon` raise OutputError where the file cannot be written, or another run writes it.
+    """
 
     def __init__(self, path: Path):
         self.path, self.partial, self.count = path, partial_name(path), 0
         with writing(path):
             self.partial.touch()
-            self.held = self.partial.open("r+b", buffering=0)  # not "w+b": it may be another run's
+            self.held = self.partial.open("r+b", buffering=0)  # "w+b" would empty another run's
             lock_file(self.held, path)
             self.held.truncate(0)
             self.disk = Disk(self.held)
@@ -42,6 +45,7 @@ class ArraysWriter:
             self.file.create_dataset(name, (0,), "i8", maxshape=(None,), chunks=(1024,))
 
     def write(self, image: np.ndarray, time: int, events: int) -> None:
+        """time: microseconds; events: how many the image is made of."""
         with writing(self.path):
             if self.count == 0:
                 self._start(*image.shape)

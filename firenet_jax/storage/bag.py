@@ -3,8 +3,8 @@
     name.bag     ROS 1
     name.ros2    ROS 2: a folder of metadata.yaml and an SQLite database, as `ros2 bag` has them
 
-Pictures are mono8 or rgb8. A message has the picture's time in its header and as its own, so that
-who reads either finds it; the frame of coordinates is named there too.
+Pictures are mono8 or rgb8. A message has the picture's time in its header and as its time of
+recording, for tools that read either; the header names the coordinate frame (frame_id), too.
 """
 
 import contextlib
@@ -24,19 +24,19 @@ from firenet_jax.storage.files import lock, locked, partial_name, writing
 IMAGE, HEADER, TIME = (
     "sensor_msgs/msg/Image", "std_msgs/msg/Header", "builtin_interfaces/msg/Time",
 )  # fmt: skip
-TOPIC = re.compile(r"/?[A-Za-z~][\w~]*(/[A-Za-z~][\w~]*)*")  # ROS's names of topics
+TOPIC = re.compile(r"/?[A-Za-z~][\w~]*(/[A-Za-z~][\w~]*)*")  # what ROS allows
 OURS = re.compile(r"metadata\.yaml(\.tmp)?|.*\.db3(-journal|-wal|-shm)?")  # in a ROS 2 bag
 
 
 def check_topic(topic: str) -> None:
-    """Raises SettingsError for what is no name of a topic."""
+    """Raises SettingsError for what is no name of a ROS topic."""
     if not TOPIC.fullmatch(topic):
-        raise SettingsError(f"topic is {topic!r}, but names are as /cam0/image_raw")
+        raise SettingsError(f"topic is {topic!r}, expected a ROS name such as /cam0/image_raw")
 
 
 class BagWriter:
-    """As `video.VideoWriter`. Raises OutputError where rosbags is not installed, another run
-    writes the bag, or a time is before 0, which ROS cannot say."""
+    """Used as `video.VideoWriter`. Raises OutputError where rosbags is not installed, the bag
+    cannot be written, another run writes it, or a time is before 0, which ROS cannot express."""
 
     def __init__(self, path: Path, topic: str, frame_id: str):
         self.path, self.partial = path, partial_name(path)
@@ -55,7 +55,7 @@ class BagWriter:
         self.types = types.get_typestore(stores.ROS2_HUMBLE if self.ros2 else stores.ROS1_NOETIC)
 
     def _start(self) -> Any:
-        """At the first picture: a database serves the thread that opened it and no other."""
+        """At the first picture: SQLite serves only the thread that opened the database."""
         _remove(self.partial, self.path)  # of a run that was killed
         choice = {"version": 9} if self.ros2 else {}
         bag = self.bag = self.library.Writer(self.partial, **choice)
@@ -101,7 +101,7 @@ class BagWriter:
             self.bag.close()
             _remove(self.path, self.path)
             self.partial.rename(self.path)
-            if self.ros2:  # the files in it are named after what it was called while it was made
+            if self.ros2:  # the database in it is still named after the partial folder
                 _rename_inside(self.path, self.partial.name)
             self.holding.close()
 
@@ -109,7 +109,7 @@ class BagWriter:
         """Removes the partial bag."""
         if self.bag is None:
             return
-        with contextlib.suppress(Exception):  # whatever a library says of a bag without an end
+        with contextlib.suppress(Exception):  # rosbags may raise any kind for an unfinished bag
             self.bag.close()
         with contextlib.suppress(OSError):
             if self.ros2:
@@ -121,7 +121,7 @@ class BagWriter:
 
 @contextlib.contextmanager
 def _writing(path: Path):
-    """As `writing`, where a full disk may be the database's own kind of error."""
+    """As `writing`; a full disk may also be an error of SQLite's own kind."""
     with writing(path):
         try:
             yield
@@ -130,7 +130,9 @@ def _writing(path: Path):
 
 
 def _remove(place: Path, name: Path) -> None:
-    """A bag that is there; raises OutputError where another run writes it, or it is none."""
+    """Removes a bag, if it is there; raises OutputError where another run writes it, or it is none.
+
+    name: what the former error calls it."""
     if not place.exists():
         return
     with locked(place, name):
@@ -138,17 +140,19 @@ def _remove(place: Path, name: Path) -> None:
             place.unlink()
             return
         if strange := strange_in(place):
-            raise OutputError(f"{place} holds {strange}, which is of no bag: choose another output")
+            raise OutputError(
+                f"{place} holds {strange}, which is not part of a bag: choose another output"
+            )
         shutil.rmtree(place)
 
 
 def strange_in(folder: Path) -> str | None:
-    """The first of the names in it that no ROS 2 bag has."""
+    """The first of the names in a folder that no ROS 2 bag has."""
     return min((e.name for e in folder.iterdir() if not OURS.fullmatch(e.name)), default=None)
 
 
 def _rename_inside(folder: Path, old: str) -> None:
-    """metadata.yaml names the database, `images.partial.ros2.db3`, as rosbags chose."""
+    """Renames the database, and in metadata.yaml: rosbags named it `images.partial.ros2.db3`."""
     metadata = folder / "metadata.yaml"
     text = metadata.read_text(encoding="utf-8").replace(f"{old}.db3", f"{folder.name}.db3")
     (folder / f"{old}.db3").rename(folder / f"{folder.name}.db3")

@@ -1,7 +1,7 @@
 """What HDF5 writes -> a file, and afterwards the first write that found no room.
 
-HDF5 ends the whole process, or leaves tracebacks that nobody can catch, where the last writes of a
-file fail: so it gets a file that takes them all.
+Where the last writes of a file fail, HDF5 ends the whole process, or prints tracebacks that nobody
+can catch: so it gets a file object whose writes never fail.
 
     with path.open("w+b", buffering=0) as opened:
         disk = Disk(opened)
@@ -16,12 +16,12 @@ from collections.abc import Iterable, Iterator
 
 
 class Disk:
-    """A file for h5py. From the first write on that fails, all are kept in memory: what HDF5 still
-    has in hand."""
+    """A file object for h5py. From the first write on that fails, all are kept in memory: what HDF5
+    has yet to write."""
 
     def __init__(self, file: io.FileIO):
         self.file, self.at, self.error = file, 0, None
-        self.late: list[tuple[int, bytes]] = []  # (place, bytes) that are not on the disk
+        self.late: list[tuple[int, bytes]] = []  # (offset, bytes) that are not on the disk
 
     def check(self) -> None:
         """Raises the OSError of the first write that failed."""

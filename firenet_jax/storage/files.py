@@ -1,4 +1,4 @@
-"""What is written -> files that are whole: each is made beside its name, and gets it in the end.
+"""What is written -> files that are whole: each is made under a name beside its own, then renamed.
 
 Files of our own that an earlier run left are read with the same care: whatever is wrong with one,
 the error names it.
@@ -15,7 +15,7 @@ from firenet_jax.errors import OutputError
 
 
 def named(path: Path) -> Path:
-    """What the user calls it: a link by its own name, `.` and `..` by theirs."""
+    """The path with a last part that is a name: `.` and `..` are resolved, links are not."""
     return path.resolve() if path.name in ("", "..") else path
 
 
@@ -25,10 +25,10 @@ def partial_name(path: Path) -> Path:
 
 
 def identity(path: Path) -> list:
-    """[name, bytes, time of the last change in ns]: other content shows in it, ready for JSON.
+    """[name, bytes, time of the last change in ns], ready for JSON: it differs for other content.
 
-    Of a folder these are those of the files in it and in its `images`: its own time stands still
-    when one of them is written anew. What is in other folders in it may be output.
+    Of a folder: all bytes and the last change of the files in it and in its `images`, as its own
+    time does not change when one of them is written anew. Its other folders may hold output.
     """
     kept = [path] if path.is_file() else [*path.iterdir(), *path.glob("images/*")]
     states = [file.stat() for file in kept if file.is_file()]
@@ -39,7 +39,7 @@ def identity(path: Path) -> list:
 def check_readable(path: Path, error: type[ValueError] = OutputError) -> None:
     """Raises `error` where the user may not read a file or list a folder.
 
-    To be asked first: libraries call such a file damaged, or do not name it.
+    Call it before a library opens the file: libraries call such a file damaged, or do not name it.
     """
     try:
         if path.is_dir():
@@ -51,7 +51,7 @@ def check_readable(path: Path, error: type[ValueError] = OutputError) -> None:
 
 
 def forbidden(path: str | Path) -> str:
-    """The sentence for it."""
+    """The message for a path that the user has no permission for."""
     return (
         f"{path}: permission denied: give yourself the right to it (chmod u+rwX), or use a copy or "
         "place that is yours"
@@ -60,7 +60,8 @@ def forbidden(path: str | Path) -> str:
 
 @contextlib.contextmanager
 def writing(path: Path):
-    """Full disks and the like, said with the name of the output and of what is in the way."""
+    """Turns an OSError (a full disk, say) into an OutputError that names the output, and the file
+    concerned if that is another one."""
     try:
         yield
     except OSError as error:
@@ -72,16 +73,17 @@ def writing(path: Path):
 
 
 def _reason(error: OSError) -> str:
-    """HDF5 tells it in the midst of two lines, with the time and an address in memory."""
+    """What the system says: HDF5 puts it amid two lines with the time and an address in memory."""
     text = error.strerror or str(error)
     told = re.search(r"error message = '([^']+)'", text)
     return told[1] if told else " ".join(text.split())
 
 
 def lock(handle: int, path: Path) -> None:
-    """Locks an open file or folder until it is closed or its process ends, however it does.
+    """Locks an open file or folder until it is closed or its process ends, even by a kill.
 
-    Raises OutputError where another run holds it. Does nothing where there are no such locks.
+    Raises OutputError, which names `path`, where another run has locked it. Does nothing where
+    there are no such locks.
     """
     try:
         import fcntl
@@ -98,7 +100,7 @@ def lock(handle: int, path: Path) -> None:
 
 
 def lock_file(file, path: Path) -> None:
-    """Locks an open file, which it closes where another run holds it."""
+    """Locks an open file as `lock` does; closes it where another run has locked it."""
     try:
         lock(file.fileno(), path)
     except OutputError:
@@ -124,7 +126,9 @@ def locked(folder: Path, name: Path | None = None):
 
 
 def write_text(path: Path, text: str) -> None:
-    """Who reads the file, while this runs or after it was killed, finds the old text or the new."""
+    """Writes UTF-8 atomically: a reader finds the old text or the new one, even after a kill.
+
+    Raises OutputError where the file cannot be written."""
     beside = partial_name(path)
     with writing(path):
         beside.write_text(text, encoding="utf-8")
@@ -132,7 +136,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_arrays(path: Path, **arrays) -> None:
-    """An .npz, likewise."""
+    """Writes an .npz, likewise."""
     beside = partial_name(path)
     with writing(path):
         np.savez_compressed(beside, **arrays)
@@ -146,6 +150,6 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         # opened here, as numpy leaves a file that is no archive open
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
-    except Exception as error:  # damaged bytes reach every kind: Value, BadZip, EOF, tokenize's
+    except Exception as error:  # damaged bytes raise every kind: Value, BadZip, EOF, tokenize's
         reason = " ".join(str(error).split())[:100]  # numpy's span lines
         raise OutputError(f"{path} is damaged ({reason}): remove it and run again") from error

@@ -1,7 +1,7 @@
 """Iterator -> the same iterator, run ahead in a thread: reading, device and writing overlap.
 
-Used as `for chunk in ahead(device(ahead(reader)))`. The work inside releases Python's lock (text
-parser, HDF5, XLA, zlib), so the stages really run side by side.
+Used as `for chunk in ahead(device(ahead(reader)))`. The work inside releases the GIL (text parser,
+HDF5, XLA, zlib), so the stages really run side by side.
 """
 
 import queue

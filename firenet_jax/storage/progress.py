@@ -31,14 +31,15 @@ class _Lines(tqdm):
         return True
 
     def close(self) -> None:
-        """Without a last line: what there is to say is said by others."""
+        """Without tqdm's last line: commands print their own."""
         if not self.disable:
             self.disable = True
             self._decr_instances(self)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def bar(total: float | None, unit: str, quiet: bool = False, **choices) -> tqdm:
-    """A bar of tqdm, on a terminal; else its lines. quiet: neither."""
+    """A bar of tqdm on a terminal, lines elsewhere. total: None where it is not known; quiet: shows
+    nothing; choices: further arguments of tqdm."""
     if quiet:
         return tqdm(total=total, unit=unit, disable=True, **choices)
     kind = tqdm if sys.stderr.isatty() else _Lines
@@ -46,8 +47,8 @@ def bar(total: float | None, unit: str, quiet: bool = False, **choices) -> tqdm:
 
 
 class Bytes:
-    """How far this process has read some files, whatever library reads them: where the system
-    tells the places of open files (Linux), else nothing."""
+    """How far this process has read some files, whatever library reads them: from the positions of
+    open files, which Linux tells; elsewhere `total` is None."""
 
     def __init__(self, paths: Sequence[Path]):
         self.sizes = {}
@@ -61,7 +62,7 @@ class Bytes:
         return sum(self.sizes.values()) or None
 
     def read(self) -> int:
-        """Bytes up to the farthest place in each file."""
+        """Bytes up to the farthest position in each file, summed."""
         for number in os.listdir("/proc/self/fd") if self.sizes else ():
             try:
                 name = os.readlink(f"/proc/self/fd/{number}")

@@ -42,8 +42,8 @@ AGAIN = "copy or download it again"
 def read_state_dict(path: str | Path) -> dict[str, np.ndarray]:
     """The tensors by name: what stands under `state_dict`, `model_state_dict` or at the top.
 
-    Raises CheckpointError for whatever is not a PyTorch checkpoint, is damaged, or asks for more
-    than data.
+    Raises CheckpointError for whatever is not a PyTorch checkpoint, is damaged, or names a class or
+    function that is not in `GLOBALS`.
     """
     path = Path(path)
     check_readable(path, CheckpointError)
@@ -64,7 +64,7 @@ def read_state_dict(path: str | Path) -> dict[str, np.ndarray]:
         raise CheckpointError(f"is not a PyTorch checkpoint ({found}); {AGAIN}")
     except CheckpointError as error:
         raise CheckpointError(f"{path} {error}") from None
-    except Exception as error:  # damaged bytes reach every kind: Index, Key, Type, Memory, BadZip
+    except Exception as error:  # damaged bytes raise every kind: Index, Key, Type, Memory, BadZip
         reason = _shown(f"{type(error).__name__}: {error}")
         raise CheckpointError(f"{path} is damaged or cut short ({reason}); {AGAIN}") from error
 
@@ -77,7 +77,7 @@ Tensors = dict[str, np.ndarray]
 def identify(
     tensors: Tensors, firsts: dict[str, str], path: str | Path, kind: str, advice: str
 ) -> tuple[str, str]:
-    """Which network the tensors are of: its title, and what stands before its names (net.).
+    """Which network the tensors are of: its title, and the prefix of their names ("net.").
 
     firsts: title -> the name of a tensor that only this network has. Raises CheckpointError where
     none of them is found, or more than one.
@@ -430,7 +430,7 @@ def _plain(key) -> bool:
 
 
 def _put(target, items: list) -> None:
-    """Keys and values by turns -> a dict."""
+    """Adds keys and values, which alternate in `items`, to a dict."""
     if isinstance(target, _Inert):
         return
     keys, values = items[::2], items[1::2]

@@ -22,7 +22,8 @@ EMPTY_DICT = b"ccollections\nOrderedDict\n)R"
 
 
 def pytorch_file(content: dict) -> bytes:
-    """The whole file. Arrays are float32; raises TypeError for what it has no place for."""
+    """The whole file. Raises TypeError for arrays that are not float32 and for other types than
+    those above."""
     storages: list[np.ndarray] = []
     pickled = PROTOCOL + _pickled(content, storages) + STOP
     stream = io.BytesIO()

@@ -2,8 +2,9 @@
 
 The record holds all that the output depends on (`runs.recorded`). Of several outputs each that is
 whole has a note beside it until all are. A folder of pictures that is not whole holds a position:
-steps taken, their pictures, and arrays to go on from. It is kept before these pictures are on disk
-and published when they are, so what is published is true.
+how many steps were taken, how many pictures they made, and arrays to go on from. It is kept in a
+file of its own before these pictures are on disk, and published (renamed) when they are: so the
+pictures of a published position are there.
 """
 
 import json
@@ -25,12 +26,12 @@ def done_file(output: Path) -> Path:
 
 
 def mark_done(output: Path, record: dict) -> None:
-    """This output is whole, though others of the same run are not."""
+    """Notes beside an output that it is whole, though others of the same run are not."""
     write_text(done_file(output), _note(output, record))
 
 
 def is_done(output: Path, record: dict) -> bool:
-    """Whether an interrupted run of the same settings has left this output, as it is now."""
+    """Whether an interrupted run of the same settings completed this output, unchanged since."""
     try:
         return done_file(output).read_text() == _note(output, record)
     except (OSError, UnicodeDecodeError):
@@ -53,7 +54,9 @@ def _kept(output: Path, steps: int) -> Path:
 
 
 def keep_position(output: Path, record: dict, steps: int, pictures: int, **arrays) -> None:
-    """To go on after these pictures, which may not be on disk yet."""
+    """Saves what is needed to go on after so many steps, whose pictures may not be on disk yet.
+
+    Raises OutputError where it cannot be written."""
     path = _kept(output, steps)
     with writing(output):
         path.parent.mkdir(exist_ok=True)
@@ -61,15 +64,18 @@ def keep_position(output: Path, record: dict, steps: int, pictures: int, **array
 
 
 def publish_position(output: Path, steps: int) -> None:
-    """What was kept after so many steps, if anything was: their pictures are on disk."""
+    """Makes what was kept after so many steps, if anything was, the position to go on from. Call it
+    when their pictures are on disk."""
     if _kept(output, steps).exists():
         os.replace(_kept(output, steps), position_file(output))
 
 
 def read_position(output: Path, record: dict, overwrite: bool) -> dict[str, Any] | None:
-    """The arrays that an interrupted run of the same settings has published; None: there are none.
+    """`steps`, `pictures` and the arrays that an interrupted run of the same settings published;
+    None if there are none.
 
-    Raises OutputError where those of another run are there, which `overwrite` allows to replace.
+    Raises OutputError for those of another run, for which `overwrite` gives None, and for a file
+    that cannot be read.
     """
     path = position_file(output)
     if not path.exists():
@@ -89,6 +95,7 @@ def read_position(output: Path, record: dict, overwrite: bool) -> dict[str, Any]
 
 
 def remove_unpublished(output: Path) -> None:
-    """By whoever holds the folder's lock: what an interrupted run kept and nobody can use."""
+    """Removes what an interrupted run kept and did not publish. Only for a run that has locked the
+    folder."""
     for path in partial_name(output).glob("resume.*.npz"):
         path.unlink()

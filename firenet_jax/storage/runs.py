@@ -35,7 +35,7 @@ def recorded(settings: Any, but: Collection[str] = (), **others: Any) -> dict:
 
 
 def as_text(record: dict) -> str:
-    """For people to read, too."""
+    """The record as JSON, which people can read, too."""
     return json.dumps(record, indent=1)
 
 
@@ -56,8 +56,8 @@ def read_record(path: Path, way_out: str) -> dict | None:
 
 
 def completed(found: dict, defaults: dict) -> dict:
-    """A record with the defaults that it lacks, in the dicts within it too: a run that is older
-    than an option had that at its default."""
+    """A record with the defaults that it lacks, in the dicts within it too: a run from before an
+    option existed had its default."""
     inner = {
         k: completed(v, defaults[k] if isinstance(defaults.get(k), dict) else {})
         for k, v in found.items()
@@ -67,7 +67,9 @@ def completed(found: dict, defaults: dict) -> dict:
 
 
 def differences(found: dict, now: dict, but: Collection[str] = ()) -> list[str]:
-    """What is said of each setting of an earlier run that differs, those within others too."""
+    """ "seed was 0, now 1" for each setting that differs; "a.b was ..." for one in a dict.
+
+    but: names that may differ."""
     said = []
     for name in sorted({*found, *now} - set(but)):
         was, is_now = found.get(name), now.get(name)
@@ -85,7 +87,7 @@ def check_same(found: dict, now: dict, what: str, way_out: str, but: Collection[
 
 
 def make_folder(folder: Path) -> None:
-    """Raises OutputError where that cannot be."""
+    """Makes it, and its parents. Raises OutputError where that cannot be."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -96,7 +98,9 @@ def make_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def alone_in(folder: Path):
-    """Makes this folder where it is missing; no other run can write into it meanwhile."""
+    """Makes this folder where it is missing; no other run can write into it meanwhile.
+
+    Raises OutputError where it cannot be made, or another run writes into it."""
     make_folder(folder)
     with locked(folder):
         yield

@@ -9,14 +9,14 @@ import time
 
 import numpy as np
 
-from firenet_jax.storage.files import OutputError
+from firenet_jax.errors import OutputError
 
 MIN_INTERVAL = 1 / 60  # seconds between two pictures at least
 MIN_WIDTH = 480  # pixels of the window's width: smaller pictures are enlarged
 
 
 class Screen:
-    """A window. Who closes it sees no more; the work goes on.
+    """A window. The work goes on when the user closes it.
 
     Raises OutputError where there is no display, or a Python without Tk.
     """

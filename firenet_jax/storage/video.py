@@ -25,13 +25,8 @@ from firenet_jax.storage import bag
 from firenet_jax.storage.files import lock_file, locked, partial_name, writing
 
 VIDEOS = (".mp4", ".gif")
-WHOLE = (
-    *VIDEOS,
-    ".h5",
-    ".bag",
-    ".ros2",
-)  # what is made in one go; anything else is a folder of png
-# What is no folder's name: a dot alone, as in out_0.35, does not make a file of it.
+WHOLE = (*VIDEOS, ".h5", ".bag", ".ros2")  # made in one go; all else is a folder of png
+# No folder's name ends so. A dot alone, as in out_0.35, does not make a file of it.
 OTHER_FILES = (
     ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".png", ".apng", ".jpg",
     ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".npy", ".npz", ".h5", ".hdf5", ".zip", ".gz",
@@ -41,14 +36,15 @@ OTHER_FILES = (
 LIKE_A_FILE = re.compile(r"\.[A-Za-z][A-Za-z0-9]{2,4}")  # nor is any other such ending
 OURS = re.compile(r"timestamps\.txt|resume[.\w]*\.npz|(frame_\d{10,}|\d{19})\.png")  # in a folder
 RATES = 0.01, 10_000  # pictures per second
-GIF_RATE = 100  # pictures per second, the most that the format can say
+GIF_RATE = 100  # pictures per second, the most that the format can express
 MP4_CLOCK = 90_000  # ticks per second, as is usual
-USUAL_RATE = 30  # pictures per second, for what an encoder wants to know
+USUAL_RATE = 30  # pictures per second, the encoder's nominal rate without --fps
 PNG_LEVEL = 4  # on grey pictures 25 % faster than the default 6, files 2 % larger
 
 
 def followed(path: Path) -> Path:
-    """What a link points to, if that can be the same kind of output: renaming replaces links."""
+    """What a link points to, if that can be the same kind of output, for renaming to a link would
+    replace the link. Raises OutputError for a link to itself."""
     if not path.is_symlink() and path.name not in ("", ".."):
         return path
     try:
@@ -71,7 +67,8 @@ def check_rate(path: Path, fps: float) -> None:
 
 
 def check_output(path: Path, overwrite: bool) -> None:
-    """Raises OutputError if something is at the final name that must not or cannot be replaced."""
+    """Raises OutputError if this cannot be an output, or something is there that must not or cannot
+    be replaced. Makes the folder that it will be in."""
     other = path.suffix.lower() in (*WHOLE, *OTHER_FILES)
     other |= LIKE_A_FILE.fullmatch(path.suffix) is not None and not path.is_dir()
     if other and path.suffix not in WHOLE:
@@ -89,7 +86,7 @@ def check_output(path: Path, overwrite: bool) -> None:
     if occupied and not overwrite:
         raise OutputError(f"{path} exists: choose another output or pass --overwrite")
     if path.is_dir() and os.path.ismount(path):
-        raise OutputError(f"{path} is a disk of its own: choose a folder in it")
+        raise OutputError(f"{path} is a mount point: choose a folder in it")
     if path.is_dir() and Path.cwd().is_relative_to(path.resolve()):
         raise OutputError(f"{path} is the folder that you are in: choose a folder in it")
     begun = partial_name(path)
@@ -116,7 +113,8 @@ def check_output(path: Path, overwrite: bool) -> None:
 
 
 def _strange(folder: Path) -> str | None:
-    """The first of the names in it that no folder of pictures, or no bag of that name, has."""
+    """The first of the names in a folder that none of our folders of pictures (of a .ros2: no bag)
+    has."""
     if folder.suffix == ".ros2":
         return bag.strange_in(folder) if folder.is_dir() else None
     names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
@@ -136,10 +134,11 @@ HEADER = "# index time_us events\n"
 class FolderWriter:
     """Pictures -> `frame_%010d.png` and `timestamps.txt`, which can go on where it stopped.
 
-    timestamps.txt holds one line a picture: the time of its last event in seconds; or, for pictures
-    `at_times`, its number, its time in microseconds and the events that it is of, under a line of
-    names. in_nanoseconds: these are named by their time, `%019d.png`, as Kalibr takes them. From
-    the beginning to the end no other run can write into the folder.
+    timestamps.txt holds one line a picture: the time of its last event in seconds; with `at_times`
+    its number, its time in microseconds and the number of its events, under `HEADER`.
+    in_nanoseconds, only with at_times: names the pictures by their time, `%019d.png`, as Kalibr
+    takes them. Until `finish` or `abandon` no other run can write into the folder.
+    Raises OutputError where the folder cannot be written, or another run writes into it.
     """
 
     def __init__(self, path: Path, at_times: bool = False, in_nanoseconds: bool = False):
@@ -168,6 +167,7 @@ class FolderWriter:
         return f"{1000 * time:019d}" if self.in_nanoseconds else f"frame_{self.count:010d}"
 
     def write(self, picture: np.ndarray, time: int, events: int = 0) -> None:
+        """time: microseconds; events: how many the picture is made of."""
         stamps = self.stamps or self.keep(0)
         name = self._name(time)
         if self.in_nanoseconds and time < 0:
@@ -231,8 +231,9 @@ class FolderWriter:
 class VideoWriter:
     """Pictures -> mp4 (H.264) or gif, all of one size.
 
-    With `fps` each is shown for as long; without, from its time on to that of the next, `speed`
-    times as fast. (Not closer to each other than the format can tell.)
+    With `fps` all are shown equally long; without, from their own time to that of the next, `speed`
+    times as fast, but not closer to each other than the format can express.
+    Raises OutputError where the file cannot be written, or another run writes it.
     """
 
     def __init__(self, path: Path, fps: float | None, speed: float = 1.0):
@@ -269,11 +270,12 @@ class VideoWriter:
 
     @property
     def slower(self) -> float | None:
-        """How many times slower than in reality it plays; None of a single moment."""
+        """Playing time over real time; None where all pictures are of one moment."""
         played, real = float(self.at * self.tick), (self.last - self.first) / 1e6
         return played / real if played > 0 and real > 0 else None
 
     def write(self, picture: np.ndarray, time: int = 0, events: int = 0) -> None:
+        """time: microseconds; with `fps` only `slower` uses it. events: not used."""
         if self.path.suffix == ".mp4":  # chroma at half the size wants even sides
             odd = [(0, side % 2) for side in picture.shape[:2]]
             picture = np.pad(picture, odd + [(0, 0)] * (picture.ndim - 2), mode="edge")
@@ -317,7 +319,7 @@ class VideoWriter:
 
 def _palette_filter(height: int, width: int, tick: Fraction) -> Graph:
     """A filter graph that gives every gif picture the 256 colours that suit it best."""
-    graph: Any = Graph()  # its types do not know formats by name
+    graph: Any = Graph()  # its type hints lack formats by name
     source = graph.add_buffer(width=width, height=height, format="rgb24", time_base=tick)
     split = graph.add("split")
     palette = graph.add("palettegen", "stats_mode=single")
