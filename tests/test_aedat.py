@@ -321,11 +321,12 @@ def test_wrong_aedat31(tmp_path, caplog):
     assert "240x180 inferred" in caplog.text
 
 
-def test_frames_of_aedat31_up_to_the_first_that_is_damaged(tmp_path):
-    good, bad = (formats.frame31((0, 0, 10, 12), PICTURE) for _ in range(2))
+def test_a_damaged_frame_of_aedat31_is_left_out_and_told(tmp_path, caplog):
+    good, bad, last = (formats.frame31((0, 0, t, t + 2), PICTURE) for t in (10, 20, 30))
     bad = bad[:20] + struct.pack("<i", 4000) + bad[24:]  # its width
-    path = write(tmp_path / "a.aedat", aedat31(polarities(), packet31(2, [good, bad])))
-    assert open_recording(path).frames.times.tolist() == [11]
+    path = write(tmp_path / "a.aedat", aedat31(polarities(), packet31(2, [good, bad, last])))
+    assert open_recording(path).frames.times.tolist() == [11, 31]
+    assert "a.aedat: damaged frames are left out: 1, the first at byte " in caplog.text
 
 
 # ---------------------------------------------------------------- AEDAT4

@@ -22,7 +22,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from firenet_jax.errors import RecordingError
+from firenet_jax.errors import RecordingError, logger
 from firenet_jax.events import Events, Frames, Rows, Triggers
 from firenet_jax.readers import Source, aedat, all_triggers, joined, reading, to_events, to_frame
 
@@ -165,19 +165,30 @@ def _triggers(layout: Layout) -> Triggers | None:
 
 
 def _frames(layout: Layout) -> Frames | None:
-    """Up to the first that is damaged; a damaged packet raises its error as events are read."""
+    """A damaged frame is left out, with a notice; after a damaged packet there are none, and it
+    raises its error as events are read."""
     times, entries = [], []  # an entry: (offset, bytes)
+    damaged, first = 0, None
     try:
         for packet, file in _of_kind(layout, FRAME):
             for number in range(packet.count):
                 offset = packet.offset + number * packet.size
-                head = _frame_head(file, offset, packet.size)
+                try:
+                    head = _frame_head(file, offset, packet.size)
+                except ValueError:
+                    damaged, first = damaged + 1, offset if first is None else first
+                    continue
                 if head["info"] & 1 and head["x"] == head["y"] == 0:
                     begin, end = int(head["open"]), int(head["shut"])
                     times.append((begin + end) // 2 + (packet.wraps << 31))
                     entries.append((offset, packet.size))
-    except (RecordingError, ValueError):
+    except RecordingError:
         pass
+    if damaged:
+        logger.warning(
+            "%s: damaged frames are left out: %d, the first at byte %d",
+            layout.path, damaged, first,
+        )  # fmt: skip
     if not entries:
         return None
     return Frames(np.array(times, np.int64), lambda i: _frame(layout.path, *entries[i]))

@@ -117,7 +117,7 @@ def restored(saved: ocp.CheckpointManager, state: Any) -> Any:
     newest = saved.latest_step()
     try:
         return saved.restore(newest, args=ocp.args.StandardRestore(state))
-    except Exception as error:  # damaged bytes reach every kind, of orbax, tensorstore and JSON
+    except Exception as error:  # damaged bytes raise every kind of orbax, tensorstore and JSON
         reason = " ".join(str(error).split())[:100]
         raise CheckpointError(
             f"{saved.directory / str(newest)} is damaged ({type(error).__name__}: {reason}): "
