@@ -25,6 +25,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
+from processes import OLD_EMITTERS  # noqa: E402
+
+# XLA reads its flags once, at the first device. What tests start has XLA's own emitters, as users
+# have, but for programs that say otherwise (`processes.FEW_OPTIMISATIONS`).
+with pytest.MonkeyPatch.context() as _patch:
+    _patch.setenv("XLA_FLAGS", f"{os.environ.get('XLA_FLAGS', '')} {OLD_EMITTERS}")
+    jax.devices()
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 

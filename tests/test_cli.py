@@ -286,6 +286,7 @@ def test_other_systems_have_no_glibc(monkeypatch):
     cli._set_malloc(cli.RETURN_FREED_MEMORY)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits of this kind")
 def test_no_room_while_writing(here):
     write_recording(here / "wide.txt", 40_000, width=200, height=150)

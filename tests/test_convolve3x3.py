@@ -108,6 +108,7 @@ def layers(convolve, kernels, image):
     return (jax.lax.scan(body, jnp.zeros_like(image[0]), image)[1] ** 2).sum()
 
 
+@pytest.mark.slow
 def test_in_scans_maps_and_computed_again():
     rng = np.random.default_rng(0)
     kernels = jnp.asarray(0.1 * rng.normal(size=(2, 3, 3, 16, 16)), jnp.float32)

@@ -389,6 +389,7 @@ def test_what_was_done_is_said_and_kept_apart(folder, tmp_path, capsys):
     assert between["means"]["over frames"] != looks["means"]["over frames"]
 
 
+@pytest.mark.slow
 def test_every_method_has_images_at_a_rate(folder, tmp_path):
     """12.5 of them a second meet every second frame; a file of the same times gives the same."""
     methods = {"methods": "firenet,e2vid,hf,mr", "stop": 0.16}

@@ -121,6 +121,7 @@ assert not [name for name in sys.modules if name.startswith(("firenet_jax", "fla
 """
 
 
+@pytest.mark.slow
 def test_stablehlo_runs_where_the_package_is_not_imported(tmp_path):
     pytest.importorskip("flatbuffers")
     weights = load_weights()

@@ -144,6 +144,7 @@ def test_textures_are_blurred_for_the_scale_at_which_they_are_seen():
     assert spectrum[kept].sum() > 0.6 * before[kept].sum()
 
 
+@pytest.mark.slow
 def test_less_blur_leaves_finer_detail():
     """The same scene but for the blur: so much more of what is finer than four pixels."""
     textures = np.random.default_rng(2).random((2, 128, 128)).astype(np.float32)
@@ -296,6 +297,7 @@ def test_motion_is_smooth_and_pauses_stand_still(scenes):
     assert pace(scenes, np.broadcast_to(inside, (MANY, 60)))[k].max() < 1
 
 
+@pytest.mark.slow
 def test_everything_may_stop_for_good():
     """Also where a second pause was drawn; before it stops and at its speed nothing changes."""
     textures = smooth_textures()
@@ -304,7 +306,8 @@ def test_everything_may_stop_for_good():
         settings = SceneSettings(objects=2, speed=SPEEDS, pause=1.0)
         usual, halted = make(settings=settings), make(settings=replace(settings, halt=1.0))
         start, _, ramp = np.asarray(halted.pauses[0])
-        assert 0 < start < 0.31 * DURATION and start == usual.pauses[0, 0]
+        assert 0 < start < 0.31 * DURATION
+        assert start == pytest.approx(float(usual.pauses[0, 0]), rel=1e-6)  # two programs
         images = [
             np.asarray(render(halted, t, **SIZE).image)
             for t in (0.0, start + ramp, 0.7 * DURATION, 9 * DURATION)

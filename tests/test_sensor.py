@@ -548,6 +548,7 @@ def test_random_sequences_have_the_declared_shapes_and_do_not_retrace(textures):
         sequences(jax.random.key(0), textures, **(SETTINGS | dict(motion=(1.0, 6.0))))
 
 
+@pytest.mark.slow
 def test_rare_sequences_are_slow_and_calm_or_swift_before_a_blank_ground(textures):
     settings = SETTINGS | {"batch": 96, "sensor": replace(FAULTY, noise=(1.0, 1.0))}
     make = partial(module.random_setups, **settings)
@@ -587,6 +588,7 @@ def test_no_window_is_so_short_that_more_than_a_pixel_passes_between_renderings(
     np.testing.assert_allclose((1e-6 * durations * scenes.speed).max(), RENDERINGS, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_half_of_the_sequences_that_stop_for_good_are_noisy_in_any_light(textures):
     scene = replace(SETTINGS["scene"], halt=0.5)
     settings = SETTINGS | {"batch": 200, "scene": scene}

@@ -231,6 +231,7 @@ def test_sequences_of_a_batch_are_of_different_ages_and_go_on_where_they_were(tm
     assert not np.allclose(seen[6:, 0], first[6:, 0], atol=0.5)
 
 
+@pytest.mark.slow
 def test_remat_and_bfloat16_change_little(tmp_path):
     settings = tiny(tmp_path)
     params = first_state(settings).params

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from processes import FEW_OPTIMISATIONS
+from processes import FEW_OPTIMISATIONS, OLD_EMITTERS
 from test_native import pytestmark as pytestmark  # where there is machine code
 
 from firenet_jax import convolution, native
@@ -124,6 +124,7 @@ def test_what_is_not_finite_stays_so_and_near(what, monkeypatch):
     assert np.isfinite(found[1][0, 1, 2 + 4 * 9 + 1 :]).all()
 
 
+@pytest.mark.slow
 def test_eight_threads_at_once():
     """Each has sizes, masks and gradients of its own."""
     rng = np.random.default_rng(0)
@@ -220,18 +221,17 @@ def run_alone(script, **environment):
 
 
 def test_on_four_devices():
-    run_alone(ON_DEVICES, XLA_FLAGS="--xla_force_host_platform_device_count=4")
+    run_alone(ON_DEVICES, XLA_FLAGS=f"{OLD_EMITTERS} --xla_force_host_platform_device_count=4")
 
 
+@pytest.mark.slow
 def test_in_forked_processes():
     """Before JAX works: after that its threads are missing in a fork, whatever it computes."""
     run_alone(FORKED)
 
 
-WITHOUT_AVX512 = pytest.param("avx2", marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize("switch", ["1", WITHOUT_AVX512])
+@pytest.mark.slow
+@pytest.mark.parametrize("switch", ["1", "avx2"])
 def test_nothing_is_touched_beside_the_arrays(switch):
     """Of the whole step and of a convolution and its gradients."""
     script = Path(__file__).with_name("guarded.py")
