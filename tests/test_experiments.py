@@ -1,6 +1,8 @@
 """Every script of `experiments/` runs to its end, on next to nothing; its figures mean nothing."""
 
+import importlib
 import importlib.util
+import json
 import os
 import re
 import shlex
@@ -52,7 +54,8 @@ SMALL = {
     "xla_vs_pytorch": "--quick --parts pipeline",
 }
 SHARED = {"figures", "harness", "pytorch_firenet"}  # no scripts: what several import
-ELSEWHERE = {"browser"}  # needs a browser: test_web_page.py uses its parts where there is one
+# "browser" needs one: test_web_page.py uses its parts where there is one.
+ELSEWHERE = {"browser", "model_card"}
 
 # What no argument makes small: line or part of it -> what stands there instead.
 SMALLER = {
@@ -107,6 +110,19 @@ SMALLER = {
 
 def test_no_script_is_forgotten():
     assert {path.stem for path in EXPERIMENTS.glob("*.py")} == SMALL.keys() | SHARED | ELSEWHERE
+
+
+def test_tables_of_the_model_card_hold_what_was_measured(monkeypatch):
+    monkeypatch.syspath_prepend(EXPERIMENTS)
+    card = importlib.import_module("model_card")
+    results = [
+        json.loads((EXPERIMENTS / "results" / f"{name}.json").read_text())
+        for name in ("shipped_weights", "endurance")
+    ]
+    text = card.CARD.read_text()
+    assert card.filled(text, *results) == text
+    results[1]["rest"][0]["correlation 50"] += 0.02
+    assert card.filled(text, *results) != text
 
 
 @pytest.mark.slow

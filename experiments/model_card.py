@@ -1,0 +1,108 @@
+"""The tables of docs/model_card.md, written anew from results/*.json; the words are left as they are.
+
+    python experiments/model_card.py
+
+A table is known by the first two cells of its header. Of the recordings' table only the numbers are
+written, in the order of results/shipped_weights.json: verdicts are somebody's.
+"""
+
+import json
+from pathlib import Path
+
+from harness import RESULTS
+
+CARD = Path(__file__).parents[1] / "docs" / "model_card.md"
+NAMES = {"published": "published", "firenet_plus": "FireNet+", "cista": "others'", "ours": "ours"}
+TWICE = ("e2vid_slider_depth.zip", "ros2_event_camera_msgs")  # another format of the one before
+RESTED = (5, 20, 50, 100)
+BRIGHTNESS = (0, 50, 100, 400, 1000)
+
+
+def accuracy(shipped: dict, endurance: dict) -> list[list[str]]:
+    keys = {"ssim": 3, "mse": 4, "ssim_equalised": 3, "mse_equalised": 4, "temporal": 4}
+    return [
+        [row["sensor"], row["speed"], row["weights"]]
+        + [f"{row[key]:.{digits}f}" for key, digits in keys.items()]
+        for row in shipped["rows"]
+    ]
+
+
+def recordings(shipped: dict, endurance: dict) -> list[list[str]]:
+    """The last two cells of each row."""
+    return [
+        [f"{row[name]['next']:.2f} ({row[name]['turned']:.2f})" for name in ("published", "ours")]
+        for row in shipped["recordings"]
+        if row["recording"] not in TWICE
+    ]
+
+
+def long(shipped: dict, endurance: dict) -> list[list[str]]:
+    found = {(r["sensor"], r["windows"], r["weights"]): r for r in endurance["long"]}
+    return [
+        [sensor, age]
+        + [f"{found[sensor, age, name]['ssim']:.3f}" for name in NAMES]
+        + [f"{found[sensor, age, name]['mse']:.4f}" for name in ("published", "ours")]
+        for sensor, age in dict.fromkeys(key[:2] for key in found)
+    ]
+
+
+def density(shipped: dict, endurance: dict) -> list[list[str]]:
+    rows = [row for row in endurance["density"] if row["speed"] == "slow"]
+    return [
+        [sensor, NAMES[name]]
+        + [
+            f"{row['ssim']:.3f}, {row['ssim_equalised']:.3f}"
+            for row in sorted(rows, key=lambda row: row["density"])
+            if (row["sensor"], row["weights"]) == (sensor, name)
+        ]
+        for sensor in ("clean", "faulty")
+        for name in NAMES
+    ]
+
+
+def rest(shipped: dict, endurance: dict) -> list[list[str]]:
+    found = {(row["noise"], row["weights"]): row for row in endurance["rest"]}
+    return [
+        [str(noise) if noise else "none", NAMES[name]]
+        + [f"{found[noise, name][f'correlation {age}']:.2f}" for age in RESTED]
+        + [", ".join(f"{found[noise, name][f'brightness {age}']:.2f}" for age in BRIGHTNESS)]
+        for noise in sorted({noise for noise, _ in found})
+        for name in NAMES
+    ]
+
+
+TABLES = {
+    ("sensor", "speed"): accuracy,
+    ("recording", "ours against the published weights"): recordings,
+    ("sensor", "windows"): long,
+    ("sensor", "weights"): density,
+    ("noise", "weights"): rest,
+}
+
+
+def filled(text: str, shipped: dict, endurance: dict) -> str:
+    """The card with its tables' numbers from these results."""
+    lines, rows = [], []
+    for line in text.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")] if line[:1] == "|" else []
+        if tuple(cells[:2]) in TABLES:
+            rows = TABLES[tuple(cells[:2])](shipped, endurance)
+        elif cells and "---" not in line:
+            new = rows.pop(0)
+            line = f"| {' | '.join(cells[: len(cells) - len(new)] + new)} |"
+        elif not cells and rows:
+            raise SystemExit(f"{CARD.name}: a table lacks {len(rows)} rows; add them by hand")
+        lines.append(line)
+    return "\n".join(lines) + "\n"
+
+
+def main():
+    shipped, endurance = (
+        json.loads((RESULTS / f"{name}.json").read_text())
+        for name in ("shipped_weights", "endurance")
+    )
+    CARD.write_text(filled(CARD.read_text(), shipped, endurance))
+
+
+if __name__ == "__main__":
+    main()
