@@ -1,4 +1,4 @@
-"""The tables of docs/model_card.md, written anew from results/*.json; the words are left as they are.
+"""The tables of docs/model_card.md, written anew from results/*.json; the words stay.
 
     python experiments/model_card.py
 
