@@ -42,6 +42,9 @@ def test_that_of_other_settings_is_refused_by_what_differs_or_replaced(output):
     np.savez(resume.position_file(output), steps=4, record="{")
     with pytest.raises(OutputError, match="resume.npz is damaged .*: remove it"):
         resume.read_position(output, RECORD, overwrite=False)
+    assert resume.read_position(output, RECORD, overwrite=True) is None
+    resume.position_file(output).write_bytes(b"PK, and no more")
+    assert resume.read_position(output, RECORD, overwrite=True) is None
 
 
 def test_an_output_is_done_while_it_and_its_settings_are_the_same(tmp_path):

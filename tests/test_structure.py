@@ -92,7 +92,6 @@ def test_computing_never_imports_presenting():
 
 LINES, PARAMETERS = 60, 7
 LARGER = {  # function: why
-    "readers.open_recording": "its docstring is what users read",
     "readers.arrays.recording": "one option a fact that no file says",
     "reconstruction.reconstruct_at": "what `reconstruct` takes, and the instants",
     "reconstruction.events_to_pictures": "one compiled program: what it is made for are options",

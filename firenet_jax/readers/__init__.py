@@ -78,33 +78,7 @@ def open_recording(
     permitted to the user, and, while the events are read, for more bad rows than that.
     """
     path = Path(path)
-    if not path.exists():
-        raise RecordingError(f"{path}: there is no such file or folder: check the path")
-    if not (path.is_file() or path.is_dir()):
-        raise RecordingError(
-            f"{path}: is a pipe or device, but a recording is read more than once: make it a file"
-        )
-    check_readable(path, RecordingError)
-    if path.is_file() and path.stat().st_size == 0:
-        raise RecordingError(f"{path}: the file is empty: copy or download it again")
-    for name in FORMATS:
-        module = importlib.import_module(f"{__name__}.{name}")
-        if module.matches(path):
-            if columns is not None and name not in ("text", "npy"):
-                raise RecordingError(
-                    f"{path}: its format sets the order of its columns: leave out --columns"
-                )
-            options: dict[str, Any] = {} if columns is None else {"columns": columns}
-            if name == "aedat2" and sensor_size is not None:  # counts rows from the bottom
-                options["size"] = sensor_size
-            source = module.read(path, **options)
-            break
-    else:
-        raise RecordingError(
-            f"{path}: not a recording of a known format: expected text (.txt, .csv) or zip, "
-            "an ECD or EVREAL folder, HDF5, .npy, .npz, N-Caltech101 .bin, .dat, .raw, .aedat, "
-            ".aedat4, .es, or a ROS bag"
-        )
+    source = _source(path, sensor_size, columns)
     rows_reported = 0
 
     def say(sentence: str, rows: int) -> None:
@@ -130,6 +104,36 @@ def open_recording(
         inferred=size is None,
         grey=source.grey,
         triggers=lambda: _in_order(source.triggers()),
+    )
+
+
+def _source(path: Path, sensor_size: tuple[int, int] | None, columns: str | None) -> Source:
+    """What the first format that knows the file reads from it."""
+    if not path.exists():
+        raise RecordingError(f"{path}: there is no such file or folder: check the path")
+    if not (path.is_file() or path.is_dir()):
+        raise RecordingError(
+            f"{path}: is a pipe or device, but a recording is read more than once: make it a file"
+        )
+    check_readable(path, RecordingError)
+    if path.is_file() and path.stat().st_size == 0:
+        raise RecordingError(f"{path}: the file is empty: copy or download it again")
+    for name in FORMATS:
+        module = importlib.import_module(f"{__name__}.{name}")
+        if not module.matches(path):
+            continue
+        if columns is not None and name not in ("text", "npy"):
+            raise RecordingError(
+                f"{path}: its format sets the order of its columns: leave out --columns"
+            )
+        options: dict[str, Any] = {} if columns is None else {"columns": columns}
+        if name == "aedat2" and sensor_size is not None:  # counts rows from the bottom
+            options["size"] = sensor_size
+        return module.read(path, **options)
+    raise RecordingError(
+        f"{path}: not a recording of a known format: expected text (.txt, .csv) or zip, "
+        "an ECD or EVREAL folder, HDF5, .npy, .npz, N-Caltech101 .bin, .dat, .raw, .aedat, "
+        ".aedat4, .es, or a ROS bag"
     )
 
 

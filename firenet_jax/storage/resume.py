@@ -74,14 +74,14 @@ def read_position(output: Path, record: dict, overwrite: bool) -> dict[str, Any]
     """`steps`, `pictures` and the arrays that an interrupted run of the same settings published;
     None if there are none.
 
-    Raises OutputError for those of another run, for which `overwrite` gives None, and for a file
-    that cannot be read.
+    Raises OutputError for those of another run and for a file that cannot be read, for both of
+    which `overwrite` gives None.
     """
     path = position_file(output)
     if not path.exists():
         return None
-    saved = read_arrays(path)
     try:
+        saved = read_arrays(path)
         found = json.loads(str(saved["record"]))
         what = f"{path.parent} holds an unfinished run of other settings or another recording"
         check_same(found, record, what, "remove it or pass --overwrite")
