@@ -506,11 +506,12 @@ MEANS = {
     "firm": DENSER,
     "hardy": DENSER,
 }
-# What is built in, an eighth each of firm, hardy and DENSER, which rest or are best in dense windows,
-# an eighth of "bare", and half of CLEARED, which keeps brightness in much noise: with less of it
-# all figures of the model card are better, and what stops for good sinks to dark.
+# What is built in, an eighth each of firm, hardy and DENSER, which rest or are best in dense
+# windows, an eighth of "bare", and half of CLEARED, which keeps brightness in much noise: with less
+# of it all figures of the model card are better, and what stops for good sinks to dark.
 SHIPPED = {
-    "dense": 35, "broad": 35, "clear": 70, "bare": 36, "calm": 8, "thick": 8, "firm": 32, "hardy": 32
+    "dense": 35, "broad": 35, "clear": 70, "bare": 36,
+    "calm": 8, "thick": 8, "firm": 32, "hardy": 32,
 }  # fmt: skip
 # For the last bias of what "ages" began from: on pictures of the pool, images were darker than
 # truth, by 0.05. What was made of it since is trained.
