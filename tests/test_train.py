@@ -225,10 +225,11 @@ def test_sequences_of_a_batch_are_of_different_ages_and_go_on_where_they_were(tm
         return simulate(*both, bounds, height=32, width=32, renderings=5)[1].tensors
 
     seen, first = np.concatenate(seen), whole(0, 12)
-    # Two programs: their rounding differs by 1.3e-4 of an event's weight on some processors.
-    np.testing.assert_allclose(seen[:, 1], first[:, 1], atol=1e-3)
-    np.testing.assert_allclose(seen[:6, 0], first[:6, 0], atol=1e-3)
-    np.testing.assert_allclose(seen[6:, 0], whole(1, 6)[:, 0], atol=1e-3)
+    # Two programs: rounding moves one event in ten thousand, by up to 6e-4 of its weight.
+    for part, alone in ((seen[:, 1], first[:, 1]), (seen[:6, 0], first[:6, 0]),
+                        (seen[6:, 0], whole(1, 6)[:, 0])):  # fmt: skip
+        np.testing.assert_allclose(part, alone, atol=1e-3)
+        assert (np.abs(part - alone) > 1e-4).mean() < 1e-4
     assert not np.allclose(seen[6:, 0], first[6:, 0], atol=0.5)
 
 
