@@ -115,6 +115,18 @@ def test_videos_decode_to_what_was_written(tmp_path, suffix, tolerance, colour):
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_the_same_pictures_give_the_same_bytes(tmp_path, suffix):
+    rng = np.random.default_rng(0)
+    blocks = np.kron(rng.integers(0, 128, (40, 40)), np.ones((8, 8), int))
+    moving = [np.roll(blocks, (k, 2 * k), (0, 1))[:180, :240] for k in range(12)]
+    pictures = [(still + rng.integers(0, 60, still.shape)).astype(np.uint8) for still in moving]
+    files = [tmp_path / f"{number}{suffix}" for number in range(16)]
+    for path in files:
+        write_video(path, pictures)
+    assert len({path.read_bytes() for path in files}) == 1
+
+
 def test_an_abandoned_video_leaves_nothing(tmp_path):
     writer = VideoWriter(tmp_path / "video.mp4", 30)
     writer.write(ramp()[0])
