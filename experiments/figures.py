@@ -20,11 +20,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
-from firenet_jax.commands.evaluate import CUTS
 from firenet_jax.evaluation import metrics
 from firenet_jax.evaluation.comparison import to_8_bit
 from firenet_jax.evaluation.equalise import equalise
 from firenet_jax.evaluation.methods import Method, Missing, load
+from firenet_jax.evaluation.protocol import CUTS
 from firenet_jax.events import Frames, Recording, concatenate
 from firenet_jax.filters import between
 from firenet_jax.pictures import event_pictures

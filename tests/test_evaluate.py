@@ -19,15 +19,16 @@ import firenet_jax
 from firenet_jax import cli
 from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.commands import evaluate, options
-from firenet_jax.commands.evaluate import Evaluate, displacement, interval, plan, run
+from firenet_jax.commands.evaluate import Evaluate, run
 from firenet_jax.commands.simulate import Picture, write_sequence
 from firenet_jax.commands.times import Times
 from firenet_jax.errors import RecordingError
-from firenet_jax.evaluation import comparison, methods, metrics
+from firenet_jax.evaluation import comparison, methods, metrics, protocol
 from firenet_jax.evaluation.baselines import e2vid
 from firenet_jax.evaluation.baselines.high_pass import HighPass
 from firenet_jax.evaluation.comparison import COMPARED, Gap, matched
 from firenet_jax.evaluation.methods import Missing, filtered, load, recurrent_unet
+from firenet_jax.evaluation.protocol import CUTS, displacement, plan
 from firenet_jax.evaluation.report import METRICS, _best, notes
 from firenet_jax.evaluation.report import steps as ticks_of
 from firenet_jax.events import Events
@@ -238,7 +239,7 @@ def test_the_pages_events_are_those_before_its_frames(folder, evaluated):
     chosen = settings(folder, evaluated[0])
     recording = open_recording(folder / "data" / "a.h5")
     shown = evaluate.show(
-        chosen, plan("data-a", recording, chosen), [("data-a", name) for name in NAMES]
+        chosen, plan("data-a", recording, chosen.protocol), [("data-a", name) for name in NAMES]
     )
     assert shown.titles == ["events", "frame", *NAMES] and len(shown.stills) == 3
     (events,) = recording.events()
@@ -444,15 +445,16 @@ def test_a_prediction_counts_once_and_within_the_tolerance():
 
 
 def test_intervals_of_the_event_camera_dataset(tmp_path):
-    assert evaluate.CUTS["office_zigzag"] == (5, 12) and evaluate.CUTS["poster_6dof"] == (5, 20)
+    assert CUTS["office_zigzag"] == (5, 12) and CUTS["poster_6dof"] == (5, 20)
     events = events_of(3000, 3_000_000)
     path = write(tmp_path / "slider_depth.h5", 31, events, period=100_000)
     recording = open_recording(path)
     (tmp_path / "mvsec_depth.zip").touch()
-    assert interval(tmp_path / "mvsec_depth.zip", Evaluate((path,), tmp_path)) == (0, np.inf)
+    whole = Evaluate((path,), tmp_path).protocol
+    assert whole.interval(tmp_path / "mvsec_depth.zip") == (0, np.inf)
 
     def counted(**changes):
-        found = plan("a", recording, Evaluate((path,), tmp_path / "out", **changes))
+        found = plan("a", recording, Evaluate((path,), tmp_path / "out", **changes).protocol)
         times = found.times[found.first], found.times[found.last - 1], found.begin
         return tuple(time / 1e6 for time in times)
 
@@ -492,7 +494,8 @@ def test_keep_ratio_thins_out_frames_alike_for_every_method(folder, tmp_path):
     results = run(settings(folder, tmp_path / "out", **choices))
     hf, mr = (results["sequences"]["b"]["methods"][name] for name in ("hf", "mr"))
     assert hf["frame_numbers"] == mr["frame_numbers"] and hf["of"] == 3  # windows of 4 frames of 9
-    other = plan("b", open_recording(data[0]), Evaluate(data, tmp_path, keep_ratio=0.5, seed=1))
+    chosen = Evaluate(data, tmp_path, keep_ratio=0.5, seed=1)
+    other = plan("b", open_recording(data[0]), chosen.protocol)
     assert other.numbers.tolist() != hf["frame_numbers"]
     with pytest.raises(ValueError, match="between frames only"):
         Evaluate(data, tmp_path, keep_ratio=0.5, duration=10.0)
@@ -695,7 +698,8 @@ def test_predictions_a_little_late_count_and_flow_needs_the_frame_before(folder,
 
 def test_flow_is_not_known_where_frames_were_left_out(tmp_path):
     path = write(tmp_path / "a.h5", 9)
-    found = plan("a", open_recording(path), Evaluate((path,), tmp_path, keep_ratio=0.7, seed=1))
+    chosen = Evaluate((path,), tmp_path, keep_ratio=0.7, seed=1)
+    found = plan("a", open_recording(path), chosen.protocol)
     gaps = np.diff(found.numbers)
     assert {1, 2} <= set(gaps.tolist())
     for place, gap in enumerate(gaps, 1):
@@ -705,7 +709,7 @@ def test_flow_is_not_known_where_frames_were_left_out(tmp_path):
 def test_temporal_errors_do_not_depend_on_where_batches_end(folder, tmp_path, monkeypatch):
     path, values = write(tmp_path / "a.h5", 8), []
     for batch in (8, 3):
-        for module in (evaluate, comparison):
+        for module in (protocol, comparison):
             monkeypatch.setattr(module, "IMAGES_AT_ONCE", batch)
         choices = {"data": (path,), "methods": "hf"}
         results = run(settings(folder, tmp_path / f"{batch}", **choices))

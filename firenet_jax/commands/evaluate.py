@@ -1,11 +1,6 @@
 """Methods x sequences -> table, JSON, CSV and a report: how close images come to camera frames.
 
-The protocol is EVREAL's for the paper's data. Window i holds the events between frames i-1 and i.
-Reconstruction begins 10 s before the part that counts. A prediction has the time of its window's
-last event (of its end, if the window is empty) and counts if that is within 1 ms of a frame. With
---between-frames, --rate, --at or --triggers images are looks at these times, while the state
-advances by windows of fixed size (instants.py). Frames and predictions are compared as (H, W)
-float32, clipped to 0 to 1, optionally after histogram equalisation. Options change each of these.
+Which frames count, and how they are compared, is evaluation/protocol.py's; options change it.
 
     OUTPUT/results/SEQUENCE/METHOD.json     written when one method has finished one sequence
     OUTPUT/results/SEQUENCE/METHOD.npz      some of its pictures
@@ -15,67 +10,40 @@ Results appear under their names when they are complete, so an interrupted run r
 others. A metric that cannot be computed is null, with a reason, never NaN.
 """
 
-import copy
 import dataclasses
 import hashlib
 import importlib
 import importlib.metadata
 import json
 import math
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import jax
 import numpy as np
 import tyro
-from tqdm import tqdm
 
 from firenet_jax.commands import options
 from firenet_jax.commands.times import Times, read_times, times_of
 from firenet_jax.errors import OutputError, RecordingError, SettingsError, logger
 from firenet_jax.evaluation import lpips, report
-from firenet_jax.evaluation.comparison import (
-    IMAGES_AT_ONCE,
-    Comparison,
-    Gap,
-    Measurements,
-    Pictures,
-    Plan,
-    matched,
-    to_8_bit,
-)
+from firenet_jax.evaluation.comparison import Gap, Plan, matched, to_8_bit
 from firenet_jax.evaluation.equalise import Kind, equalise
-from firenet_jax.evaluation.methods import METHODS, Method, Missing, digest, load, look
+from firenet_jax.evaluation.methods import METHODS, Method, Missing, digest, load
+from firenet_jax.evaluation.protocol import Protocol, evaluate, plan, steps_of
 from firenet_jax.evaluation.results import METRICS, Measured, mean, summary
-from firenet_jax.events import Frames, Recording
-from firenet_jax.filters import check_span
-from firenet_jax.instants import Step, steps
+from firenet_jax.events import Recording
 from firenet_jax.readers import FORMATS, open_recording
-from firenet_jax.settings import check_seed, parse_size
+from firenet_jax.settings import parse_size
 from firenet_jax.storage.files import identity, named, read_arrays, write_arrays, write_text
-from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import bar
 from firenet_jax.storage.runs import alone_in, check_same, differences, make_folder, read_record
 from firenet_jax.storage.video import write_video
-from firenet_jax.windows import Window, Windows, cut, in_words, usual
+from firenet_jax.windows import Windows
 
-# Seconds from the beginning of the Event Camera Dataset's sequences (EVREAL's; one of E2VID's
-# authors gave the same in rpg_e2vid's issue 17).
-CUTS = {
-    "boxes_6dof": (5.0, 20.0),
-    "calibration": (5.0, 20.0),
-    "dynamic_6dof": (5.0, 20.0),
-    "office_zigzag": (5.0, 12.0),
-    "poster_6dof": (5.0, 20.0),
-    "shapes_6dof": (5.0, 20.0),
-    "slider_depth": (1.0, 2.5),
-}
 # Formats that can hold frames.
 SUFFIXES = (".h5", ".hdf5", ".hdf", ".zip", ".bag", ".mcap", ".aedat", ".aedat4")
-MIN_SIDE = 17  # pixels of a side: what CW-SSIM's filters need
 MAX_VIDEO_WIDTH = 2000  # pixels
 
 
@@ -148,20 +116,8 @@ class Evaluate:
             )
         if not self.method_names:
             raise SettingsError(f"no methods: choose from {', '.join(METHODS)}")
-        Windows(events=self.events, duration=self.duration)  # refuses numbers that cannot be
-        if not 0 < self.keep_ratio <= 1:
-            raise SettingsError(f"keep ratio is {self.keep_ratio}, but is a share, 0 to 1")
-        if self.keep_ratio < 1 and not self.frame_to_frame:
-            raise SettingsError(
-                "keep ratio thins out frames: it varies windows between frames only"
-            )
-        for name in ("warm_up", "tolerance"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise SettingsError(f"{name} is {value}, but must be 0 or more")
-        check_seed(self.seed)
-        check_span(self.start, self.stop)
         parse_size(self.sensor_size)
+        _ = self.protocol  # refuses what cannot be
 
     @property
     def method_names(self) -> list[str]:
@@ -171,12 +127,21 @@ class Evaluate:
         return [name.strip() for name in self.methods.split(",") if name.strip()]
 
     @property
-    def frame_to_frame(self) -> bool:
-        return self.events is None and self.duration is None and not self.times.wanted
-
-    @property
-    def windows(self) -> Windows:
-        return Windows(self.events, None, self.duration, self.frame_to_frame)
+    def protocol(self) -> Protocol:
+        """Raises SettingsError for invalid values."""
+        wanted = self.times.wanted
+        frame_to_frame = self.events is None and self.duration is None and not wanted
+        return Protocol(
+            Windows(self.events, None, self.duration, frame_to_frame),
+            self.times.in_words() if wanted else None,
+            self.keep_ratio,
+            self.seed,
+            self.start,
+            self.stop,
+            self.warm_up,
+            self.tolerance,
+            self.equalise,
+        )
 
 
 def run(settings: Evaluate) -> dict:
@@ -214,7 +179,9 @@ def run(settings: Evaluate) -> dict:
         }
         for name, recording in recordings.items():
             try:
-                plans[name] = plan(name, recording, settings)
+                found = plan(name, recording, settings.protocol)
+                wanted = times_of(settings.times, recording, recording.events())
+                plans[name] = found._replace(wanted=wanted)
             except (Gap, RecordingError) as error:
                 logger.warning("%s: %s", recording.path, error)
                 gaps = {(name, method.name): str(error) for method in methods} | gaps
@@ -246,7 +213,7 @@ def compute(
             progress.set_postfix_str(f"{name}, {method}")
             try:
                 found, pictures = evaluate(
-                    plans[name], by_name[method], settings, learned, progress
+                    plans[name], by_name[method], settings.protocol, learned, progress
                 )
             except (Gap, RecordingError) as error:
                 logger.warning("%s, %s: %s", name, method, error)
@@ -295,175 +262,6 @@ def recordings_in(folder: Path) -> list[Path]:
         elif path.suffix.lower() in SUFFIXES and ".partial" not in path.name:
             found.append(path)
     return found
-
-
-def plan(name: str, recording: Recording, settings: Evaluate) -> Plan:
-    """Which frames count and where reconstruction begins. Raises Gap where nothing can count."""
-    frames = recording.frames
-    if frames is None or len(frames.times) < 2:
-        raise Gap("no frames")
-    height, width = frames.read(0).shape
-    if (height, width) != (recording.height, recording.width):
-        raise Gap(
-            f"frames are {width}x{height}, the sensor is {recording.width}x{recording.height}"
-        )
-    if min(height, width) < MIN_SIDE:
-        raise Gap(f"{width}x{height} pixels are too small to be compared")
-    times = np.asarray(frames.times, np.int64)
-    if (np.diff(times) < 0).any():
-        raise Gap("times of frames run backwards")
-    begin = first_event(recording, times)
-    origin = min(begin, int(times[0]))
-    numbers = np.arange(len(times))
-    if settings.keep_ratio < 1:
-        count = max(2, int(settings.keep_ratio * len(times)))
-        draw = np.random.default_rng(settings.seed)
-        numbers = np.sort(draw.choice(len(times), count, replace=False))
-        times = times[numbers]
-    start, stop = interval(recording.path, settings)
-    seconds = (times - origin) / 1e6
-    counting = np.flatnonzero((seconds >= start) & (seconds <= stop))
-    counting = counting[counting > 0]  # no window ends at the first frame
-    if not counting.size:
-        raise Gap(f"no frames from {start:g} to {stop:g} s")
-    first, last = int(counting[0]), int(counting[-1]) + 1
-    # Reconstruction begins at a frame, so that windows between frames are whole.
-    warm = np.searchsorted(times, origin + round(1e6 * (start - settings.warm_up)), "right") - 1
-    if warm >= 0:
-        begin = max(begin, int(times[min(warm, first - 1)]))
-    windows, wanted = settings.windows, times_of(settings.times, recording, recording.events())
-    if windows == Windows():
-        windows = usual(recording.events())
-    return Plan(
-        name, recording, numbers, times, first, last, origin, begin, windows=windows, wanted=wanted
-    )
-
-
-def interval(path: Path, settings: Evaluate) -> tuple[float, float]:
-    """Seconds from the sequence's beginning: what counts."""
-    if settings.start is None and settings.stop is None:
-        name = named(path).name if path.is_dir() else path.stem
-        return CUTS.get(name, (0.0, math.inf))
-    return settings.start or 0.0, math.inf if settings.stop is None else settings.stop
-
-
-def first_event(recording: Recording, times: np.ndarray) -> int:
-    """Its time. Raises Gap where the events do not reach from before the last frame to after the
-    first."""
-    first, last = None, 0
-    for events in recording.events():
-        first = int(events.t[0]) if first is None else first
-        last = int(events.t[-1])
-        if last >= times[0]:
-            break
-    if first is None:
-        raise Gap("no events")
-    if first > times[-1] or last < times[0]:
-        raise Gap(
-            f"no overlap in time: frames {times[0] / 1e6:.6f} to {times[-1] / 1e6:.6f} s, events "
-            + (f"from {first / 1e6:.6f} s" if first > times[-1] else f"up to {last / 1e6:.6f} s")
-        )
-    return first
-
-
-def steps_of(plan: Plan) -> Iterator[Window | Step]:
-    """Windows, which have an image each; or, of images at given times, the steps for those."""
-    recording = plan.recording
-    later = (e.select(slice(np.searchsorted(e.t, plan.begin), None)) for e in recording.events())
-    if plan.wanted is not None:  # a grid counts on
-        return steps(recording, plan.windows, copy.copy(plan.wanted), filter(len, later))
-    recording = dataclasses.replace(recording, frames=Frames(plan.times, plan.frames.read))
-    return cut(recording, plan.windows, filter(len, later), plan.begin)
-
-
-def predicted(
-    plan: Plan, method: Method, entries: Iterator[Window | Step]
-) -> Iterator[tuple[int, int, jax.Array]]:
-    """Yields (time, events, image) of each window, or of each step that looks."""
-    before = last = method.initial(plan.recording.height, plan.recording.width)
-    time = plan.begin
-    for entry in entries:
-        if isinstance(entry, Step) and entry.time is not None:
-            yield entry.time, len(entry.events), look(method, before, last, entry)
-            continue
-        if isinstance(entry, Window):
-            time = entry.time
-        elif len(entry.events):  # a step that is kept
-            time = int(entry.events.t[-1])
-        before = last
-        last, image = method.step(last, Window(entry.events, time))
-        if isinstance(entry, Window):
-            yield time, len(entry.events), image
-
-
-def until(latest: int, entries: Iterator[Window | Step]) -> Iterator[Window | Step]:
-    """Those that images up to this time need."""
-    for entry in entries:
-        time = entry.time
-        if time is None:  # kept, for images from its end on
-            time = int(entry.events.t[0]) if len(entry.events) else latest
-        if time > latest:
-            return
-        yield entry
-
-
-def displacement(plan: Plan, place: int) -> np.ndarray | None:
-    """(H, W, 2) pixels since the frame before, where the recording has flow and the frame before
-    is used too."""
-    flow, number = plan.frames.flow, int(plan.numbers[place])
-    if flow is None or place == 0 or number != plan.numbers[place - 1] + 1:
-        return None
-    velocity = flow(number)
-    if velocity is None:
-        return None
-    seconds = np.float32(1e-6 * (plan.times[place] - plan.times[place - 1]))
-    return seconds * np.moveaxis(velocity.astype(np.float32), 0, -1)
-
-
-# ---- One method and one sequence
-
-
-def evaluate(
-    plan: Plan, method: Method, settings: Evaluate, learned: lpips.Lpips | None, progress: tqdm
-) -> tuple[Measured, dict[str, np.ndarray]]:
-    """-> (numbers for each frame; pictures (n, H, W) uint8 and their frames).
-
-    Raises Gap where no prediction counts or an image is not finite.
-    """
-    began, before = time.monotonic(), progress.n
-    entries = ahead(iter(steps_of(plan)), depth=4)
-    tolerance = round(1000 * settings.tolerance)
-    latest = int(plan.times[plan.last - 1]) + tolerance
-    empty = 0
-
-    def predictions():
-        nonlocal empty
-        for time_of, events, image in predicted(plan, method, until(latest, entries)):
-            empty += events == 0
-            passed = np.searchsorted(plan.times, time_of, "right")
-            progress.update(int(min(passed, plan.last)) - (progress.n - before))
-            yield time_of, image
-
-    found, pictures = Measurements(plan, settings.equalise, learned), Pictures(plan)
-    waiting: list[Comparison] = []
-    try:
-        for place, image in matched(predictions(), plan.times, tolerance):
-            if plan.first <= place < plan.last:
-                truth = plan.frames.read(int(plan.numbers[place]))
-                if truth.shape != image.shape:
-                    raise Gap(f"frame {plan.numbers[place] + 1} is of another size: {truth.shape}")
-                waiting.append(Comparison(place, image, truth, displacement(plan, place)))
-            if len(waiting) == IMAGES_AT_ONCE:
-                pictures.add(waiting, found.add(waiting))
-                waiting = []
-        if waiting:
-            pictures.add(waiting, found.add(waiting))
-    finally:
-        entries.close()
-        progress.update(plan.last - (progress.n - before))
-    if not found.places:
-        raise Gap(f"no prediction within {settings.tolerance:g} ms of a frame")
-    return found.result(empty, time.monotonic() - began), pictures.arrays()
 
 
 # ---- Results on disk
@@ -554,19 +352,19 @@ def summarise(settings, shared, plans, recordings, methods, done, gaps) -> dict:
             key = name, method.name
             found = done.get(key)
             entries[method.name] = {"gap": gaps[key]} if found is None else summary(found)
-        start, stop = interval(recording.path, settings)
+        start, stop = settings.protocol.interval(recording.path)
         sequences[name] = {
             "path": str(recording.path),
             "format": recording.format,
             "sensor": [recording.width, recording.height],
             "counted_seconds": [start, None if math.isinf(stop) else stop],
-            "images": None if name not in plans else images_in_words(plans[name], settings),
+            "images": None if name not in plans else settings.protocol.images_in_words(plans[name]),
             "methods": entries,
         }
     names = [method.name for method in methods]
     return {
         "settings": shared,
-        "protocol": protocol(settings),
+        "protocol": settings.protocol.in_words(),
         "metrics": {name: metric._asdict() for name, metric in METRICS.items()},
         "methods": {m.name: getattr(m, "record", None) for m in methods},
         "sequences": sequences,
@@ -575,43 +373,6 @@ def summarise(settings, shared, plans, recordings, methods, done, gaps) -> dict:
             "over frames": {name: mean(sequences, name, weigh=True) for name in names},
         },
     }
-
-
-def images_in_words(plan: Plan, settings: Evaluate) -> str:
-    """ "images at the times of its frames, the state by windows of 15,120 events" """
-    windows = in_words(plan.windows, plan.recording.pixels)
-    if not settings.times.wanted:
-        return windows
-    return f"{settings.times.in_words()}, the state by {windows}"
-
-
-def protocol(settings: Evaluate) -> list[str]:
-    """What was done, in sentences, for people who read a table."""
-    if settings.frame_to_frame:
-        windows = "windows between frames"
-    elif settings.events is not None:
-        windows = f"windows of {settings.events} events"
-    elif settings.duration is not None:
-        windows = f"windows of {settings.duration:g} ms"
-    else:
-        windows = "windows of 0.35 events per pixel, at most 40 ms or a twentieth of a recording"
-    if settings.times.wanted:
-        windows = (
-            f"{settings.times.in_words()}, each a look whose state is thrown away; the state by "
-            f"{windows} (hf and mr look at the events since)"
-        )
-    if settings.keep_ratio < 1:
-        windows += f", {settings.keep_ratio:g} of the frames kept (seed {settings.seed})"
-    return [
-        f"{windows}; warm-up of up to {settings.warm_up:g} s; predictions within "
-        f"{settings.tolerance:g} ms of a frame count",
-        f"histogram equalisation before metrics: {settings.equalise} (temporal error: none); "
-        "images clipped to 0 to 1, E2VID's stretched before (1st to 99th percentile)",
-        "SSIM: Gaussian window of 11x11 pixels, sigma 1.5, population covariance, data range 1, "
-        "without the border; PSNR in dB for a range of 1",
-        "temporal error: mean M |I_k - W(I_k-1)|, warped by the data's optical flow; Features: "
-        "distance between features of a random network",
-    ]
 
 
 def write_all(settings: Evaluate, results: dict, plans: dict[str, Plan], done: list) -> None:
@@ -683,7 +444,7 @@ def events_before(plan: Plan, settings: Evaluate, numbers: set[int]) -> dict[int
     Drawn anew from the recording, and not kept with each method: it is as long as one of them."""
     recording, found, left = plan.recording, {}, set(numbers)
     windows = ((e.time, e.events) for e in steps_of(plan) if e.time is not None)
-    for place, events in matched(windows, plan.times, round(1000 * settings.tolerance)):
+    for place, events in matched(windows, plan.times, settings.protocol.tolerated):
         if not left:
             break
         if (number := int(plan.numbers[place])) in left:
