@@ -35,7 +35,7 @@ from harness import save
 from matplotlib.figure import Figure
 
 from firenet_jax.commands.evaluate import Evaluate, run
-from firenet_jax.commands.simulate import Picture, write_sequence
+from firenet_jax.storage.sequence_file import Picture, write_sequence
 
 PAPER = {  # sequence: numbers of HF, MR, E2VID, FireNet
     "mse": {

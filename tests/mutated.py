@@ -301,12 +301,12 @@ def mutated(rng: np.random.Generator, data: bytes) -> bytes:
 def read(name: str, path: Path) -> None:
     """As the program reads it."""
     from firenet_jax.checkpoint import load_weights
-    from firenet_jax.commands import simulate as dataset
     from firenet_jax.commands.times import read_times
     from firenet_jax.filters import read_hot_pixels
     from firenet_jax.live import sources
     from firenet_jax.readers import open_recording
     from firenet_jax.simulation import textures
+    from firenet_jax.simulation.clip import read_clip
     from firenet_jax.storage.files import read_arrays
     from firenet_jax.storage.runs import read_record
     from firenet_jax.training import batches
@@ -339,7 +339,7 @@ def read(name: str, path: Path) -> None:
     elif name == "weights.npz" or name.endswith((".pth", ".tar")):
         load_weights(path)
     elif name.startswith("clip"):
-        for _ in dataset.read_clip(path):
+        for _ in read_clip(path):
             pass
     elif name.startswith("picture"):
         textures.load_textures(path.parent, 1, 32, 0)

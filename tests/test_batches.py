@@ -9,10 +9,11 @@ import pytest
 import references
 
 from firenet_jax.commands import simulate as dataset
-from firenet_jax.commands.simulate import Picture, Simulate, write_sequence
+from firenet_jax.commands.simulate import Simulate
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events
 from firenet_jax.simulation.textures import load_textures
+from firenet_jax.storage.sequence_file import Picture, write_sequence
 from firenet_jax.training.batches import (
     NO_AUGMENT,
     Augment,

@@ -11,22 +11,18 @@ from PIL import Image
 
 from firenet_jax import cli
 from firenet_jax.commands import simulate as dataset
-from firenet_jax.commands.simulate import (
-    Picture,
-    Simulate,
-    read_clip,
-    rounded_flow,
-    run,
-    write_sequence,
-)
+from firenet_jax.commands.simulate import Simulate, rounded_flow, run
 from firenet_jax.errors import OutputError
 from firenet_jax.events import Events, concatenate
 from firenet_jax.readers import open_recording
+from firenet_jax.simulation.clip import read_clip
 from firenet_jax.simulation.scenes import SceneSettings
 from firenet_jax.simulation.sensor import EPS
 from firenet_jax.simulation.textures import load_textures
+from firenet_jax.storage import sequence_file
 from firenet_jax.storage.files import locked
 from firenet_jax.storage.runs import alone_in
+from firenet_jax.storage.sequence_file import Picture, write_sequence
 from firenet_jax.storage.video import write_video
 from firenet_jax.warp import warp
 
@@ -110,7 +106,7 @@ def same(path, other):
 
 @pytest.mark.parametrize("pieces", [7, 1000, 100_000])
 def test_what_is_written_is_read_back(tmp_path, monkeypatch, pieces):
-    monkeypatch.setattr(dataset, "ROWS", 1024)
+    monkeypatch.setattr(sequence_file, "ROWS", 1024)
     events, pictures = random_events(5000), random_pictures([0, 20_000, 500_000, 2_000_000])
     path = tmp_path / "a.h5"
     write_sequence(path, in_pieces(events, pieces), iter(pictures), height=HEIGHT, width=WIDTH)
@@ -243,7 +239,7 @@ class Interrupted(BaseException):
 
 def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, monkeypatch):
     run(settings(tmp_path / "whole"))
-    real, calls = dataset._gathered, []
+    real, calls = sequence_file._gathered, []
 
     def gathered(events):
         calls.append(1)
@@ -253,10 +249,10 @@ def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, monkeypatch):
             yield part
 
     folder = tmp_path / "part"
-    monkeypatch.setattr(dataset, "_gathered", gathered)
+    monkeypatch.setattr(sequence_file, "_gathered", gathered)
     with pytest.raises(Interrupted):
         run(settings(folder))
-    monkeypatch.setattr(dataset, "_gathered", real)
+    monkeypatch.setattr(sequence_file, "_gathered", real)
     assert [p.name for p in folder.rglob("*.h5")] == ["000000.h5"]
     first = (folder / "train/000000.h5").stat()
     (folder / "train/000001.partial.h5").write_bytes(b"of a run that was killed")

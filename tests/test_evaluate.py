@@ -20,7 +20,6 @@ from firenet_jax import cli
 from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.commands import evaluate, options
 from firenet_jax.commands.evaluate import Evaluate, run
-from firenet_jax.commands.simulate import Picture, write_sequence
 from firenet_jax.commands.times import Times
 from firenet_jax.errors import RecordingError
 from firenet_jax.evaluation import comparison, methods, metrics, protocol
@@ -38,6 +37,7 @@ from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import images_at
 from firenet_jax.storage.files import OutputError
 from firenet_jax.storage.pytorch_file import CheckpointError
+from firenet_jax.storage.sequence_file import Picture, write_sequence
 from firenet_jax.tensors import normalise, pack, voxelise
 from firenet_jax.windows import Window, Windows
 

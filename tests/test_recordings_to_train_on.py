@@ -12,13 +12,13 @@ from test_train import entries, tiny
 import firenet_jax as fj
 from firenet_jax import cli
 from firenet_jax.commands import train
-from firenet_jax.commands.simulate import Picture, write_sequence
 from firenet_jax.errors import OutputError, RecordingError, SettingsError
 from firenet_jax.evaluation import metrics
 from firenet_jax.events import Events, concatenate
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.readers import open_recording
 from firenet_jax.simulation.sensor import Simulation
+from firenet_jax.storage.sequence_file import Picture, write_sequence
 from firenet_jax.training.settings import Train
 from firenet_jax.training.step import loss_of, near_events
 

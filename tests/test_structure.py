@@ -31,8 +31,8 @@ LAYERS = [
 # Each outside library enters by one door.
 DOORS = {
     "flax": {"network", "checkpoint", "evaluation.baselines"}, "optax": {"training.step"},
-    "orbax": {"training.run"}, "torch": set(), "av": {"storage.video", "commands.simulate"},
-    "h5py": {"readers", "training.batches", "commands.simulate", "storage.arrays"},
+    "orbax": {"training.run"}, "torch": set(), "av": {"storage.video", "simulation.clip"},
+    "h5py": {"readers", "training.batches", "storage"},
     "pyarrow": {"readers"}, "grain": {"training.batches"}, "faery": {"readers"},
     "rosbags": {"readers", "storage.bag"}, "hdf5plugin": {"readers"},
     "skimage": {"evaluation.equalise"}, "llvmlite": {"native"}, "onnx": {"export"},

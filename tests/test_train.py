@@ -17,7 +17,6 @@ import pytest
 from processes import FEW_OPTIMISATIONS, finish, start, together
 
 from firenet_jax.checkpoint import load_weights, save_weights
-from firenet_jax.commands.simulate import Picture, write_sequence
 from firenet_jax.errors import OutputError
 from firenet_jax.events import Events
 from firenet_jax.network import Weights, initial_params
@@ -25,6 +24,7 @@ from firenet_jax.simulation.scenes import SceneSettings
 from firenet_jax.simulation.sensor import FAULTY, simulate, window_bounds
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage.files import locked
+from firenet_jax.storage.sequence_file import Picture, write_sequence
 from firenet_jax.training import run as train
 from firenet_jax.training import settings as train_settings
 from firenet_jax.training import step as train_steps
@@ -90,7 +90,7 @@ import sys
 import time
 from pathlib import Path
 from unittest.mock import Mock
-from firenet_jax.commands.simulate import Picture, write_sequence
+from firenet_jax.storage.sequence_file import Picture, write_sequence
 from firenet_jax.errors import OutputError
 from firenet_jax.events import Events
 from firenet_jax.training.losses import Loss

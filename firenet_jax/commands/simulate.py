@@ -1,45 +1,30 @@
 """Random scenes, or a video file -> simulated events in HDF5 training sets, one sequence per file.
 
-The layout is that of event_cnn_minimal (Stoffregen et al. 2020), which many programs read:
-
-    events/{xs, ys, ts, ps}   int16, int16, float64 seconds, bool; compressed
-    images/image%09d          (H, W) uint8; attributes timestamp, event_idx, size
-    flow/flow%09d             (2, H, W) float32, x then y, pixels per second on that image's grid;
-                              attributes timestamp, size
-    attributes                sensor_resolution (H, W), num_events, num_pos, num_neg, t0, tk,
-                              duration, num_imgs, num_flow, source, and settings (JSON)
-
-Flow i is the exact displacement from one picture period before image i to image i, divided by that
-period. Times the period it is a displacement d for backward warping: what is at x in image i was at
-x - d(x) before. Files appear under their names when they are complete, so an interrupted run
-resumes.
+The layout is that of event_cnn_minimal, see `storage.sequence_file`. Files appear under their names
+when they are complete, so an interrupted run resumes.
 """
 
 import contextlib
 import importlib.metadata
 import itertools
-import json
 import math
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
 from time import sleep
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
-import av
-import h5py
 import jax
 import numpy as np
 import tyro
-from av.error import FFmpegError
 
 from firenet_jax.devices import share
 from firenet_jax.errors import OutputError, PictureError, SettingsError
-from firenet_jax.events import Events, concatenate
+from firenet_jax.events import Events
 from firenet_jax.settings import check_seed, parse_size
+from firenet_jax.simulation.clip import read_clip
 from firenet_jax.simulation.scenes import (
     Scene,
     SceneSettings,
@@ -49,15 +34,13 @@ from firenet_jax.simulation.scenes import (
     video,
 )
 from firenet_jax.simulation.sensor import (
-    MAX_INTERVAL,
     SensorSettings,
     event_list,
     random_sensor,
     with_faults,
 )
 from firenet_jax.simulation.textures import load_textures
-from firenet_jax.storage.disk import Disk
-from firenet_jax.storage.files import check_readable, partial_name, write_text, writing
+from firenet_jax.storage.files import partial_name, write_text
 from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import bar
 from firenet_jax.storage.runs import (
@@ -69,9 +52,8 @@ from firenet_jax.storage.runs import (
     read_record,
     recorded,
 )
+from firenet_jax.storage.sequence_file import Picture, write_sequence
 
-ROWS = 1 << 16  # events in a chunk of the file, and so many are written at once
-GZIP = 4  # for 50 % more time than level 1: events take 10 % less room, flow 25 %
 FLOW_BITS = 11  # of the fastest pixel's flow, see `rounded_flow`
 SEQUENCES_PER_POOL = 32  # sequences that share a pool of textures
 TEXTURES, TEXTURE_SIZE = 64, 320  # of a pool
@@ -154,131 +136,6 @@ class Simulate:
                 raise SettingsError(
                     f"{', '.join(idle)}: no part in turning a video into events: leave it out"
                 )
-
-
-class Picture(NamedTuple):
-    """What a camera beside the events sees."""
-
-    time: int  # microseconds
-    image: np.ndarray  # (H, W) uint8
-    flow: np.ndarray | None  # (2, H, W) float32, pixels per second, x then y
-
-
-# ---- Files
-
-
-def write_sequence(
-    path: Path,
-    events: Iterable[Events],
-    pictures: Iterable[Picture],
-    *,
-    height: int,
-    width: int,
-    source: str = "unknown",
-    settings: dict | None = None,
-) -> int:
-    """Time-ordered events and pictures -> one file; returns the number of events.
-
-    Memory does not grow with either. source: a name of the layout's list ("esim", "unknown").
-    settings: what the file was made from, kept in it as JSON.
-    Raises OutputError where it cannot be written. What else goes wrong goes through, but leaves
-    nothing under the final name, nor beside it.
-    """
-    beside = partial_name(path)
-    try:
-        with writing(path), beside.open("w+b", buffering=0) as opened:
-            disk = Disk(opened)
-            with h5py.File(disk, "w") as file:
-                times, flows = _write_pictures(file, disk.during(pictures), height, width)
-                count, facts = _write_events(file, disk.during(events), times)
-                file.attrs.update(
-                    sensor_resolution=np.array([height, width], np.int64),
-                    num_imgs=len(times),
-                    num_flow=flows,
-                    source=source,
-                    settings=json.dumps(settings or {}),
-                    **facts,
-                )
-            disk.check()
-        with writing(path):
-            beside.replace(path)
-    except BaseException:
-        beside.unlink(missing_ok=True)
-        raise
-    finally:
-        for stream in (events, pictures):
-            getattr(stream, "close", bool)()  # of generators: ends their threads, closes files
-    return count
-
-
-def _write_pictures(file, pictures: Iterable[Picture], height, width) -> tuple[np.ndarray, int]:
-    """Returns the pictures' times (n,) int64, and how many of them have flow."""
-    times, flows = [], 0
-    images = file.create_group("images")
-    packed = {"compression": "gzip", "compression_opts": GZIP, "shuffle": True}
-    for number, picture in enumerate(pictures):
-        size = picture.image.shape
-        if size != (height, width):
-            raise ValueError(f"picture {number} is {size}, expected {(height, width)}")
-        image = images.create_dataset(
-            f"image{number:09d}", data=picture.image, chunks=size, **packed
-        )
-        image.attrs.update(timestamp=1e-6 * picture.time, size=size, type="greyscale")
-        times.append(picture.time)
-        if picture.flow is not None:
-            flow = file.require_group("flow").create_dataset(
-                f"flow{number:09d}", data=picture.flow, chunks=picture.flow.shape, **packed
-            )
-            flow.attrs.update(timestamp=1e-6 * picture.time, size=picture.flow.shape)
-            flows += 1
-    return np.array(times, np.int64), flows
-
-
-def _write_events(file, events: Iterable[Events], times: np.ndarray) -> tuple[int, dict]:
-    """Returns how many there are, and the file's attributes about them.
-
-    An image's event_idx is the number of events before its time: the first that is not earlier.
-    """
-    columns = {
-        name: file.create_dataset(
-            f"events/{name}", (0,), dtype, maxshape=(None,), chunks=(ROWS,),
-            compression="gzip", compression_opts=GZIP, shuffle=True,
-        )
-        for name, dtype in (("xs", np.int16), ("ys", np.int16), ("ts", np.float64), ("ps", bool))
-    }  # fmt: skip
-    count = on = 0
-    first = last = None
-    before = np.zeros(len(times), np.int64)
-    for part in _gathered(events):
-        rows = slice(count, count + len(part))
-        values = {"xs": part.x, "ys": part.y, "ts": part.t / 1e6, "ps": part.p}
-        for name, column in columns.items():
-            column.resize((rows.stop,))
-            column[rows] = values[name]
-        before += np.searchsorted(part.t, times)
-        count, on = rows.stop, on + int(part.p.sum())
-        first, last = int(part.t[0]) if first is None else first, int(part.t[-1])
-    for image, index in zip(file["images"].values(), before, strict=True):
-        image.attrs["event_idx"] = index
-    start, end = 1e-6 * (first or 0), 1e-6 * (last or 0)
-    facts = {"num_events": count, "num_pos": on, "num_neg": count - on}
-    return count, facts | {"t0": start, "tk": end, "duration": end - start}
-
-
-def _gathered(chunks: Iterable[Events]) -> Iterator[Events]:
-    """The same events in chunks of ROWS, so that each is compressed once; the last is shorter."""
-    waiting, count = [], 0
-    for chunk in chunks:
-        waiting.append(chunk)
-        count += len(chunk)
-        if count >= ROWS:
-            whole = concatenate(waiting)
-            full = count - count % ROWS
-            for start in range(0, full, ROWS):
-                yield whole.select(slice(start, start + ROWS))
-            waiting, count = [whole.select(slice(full, None))], count - full
-    if count:
-        yield concatenate(waiting)
 
 
 # ---- Sequences
@@ -530,43 +387,3 @@ def simulate_clip(settings: Simulate, clip: Path) -> Path:
     )
     print(f"{path}: {count:,} events of {width}x{height} pixels")
     return path
-
-
-def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Picture]:
-    """A video file -> its pictures in grey, times from the first; scaled to (height, width).
-
-    Raises PictureError for what cannot be read, or whose times stand still or leave gaps.
-    """
-    first = last = None
-    check_readable(path)
-    try:
-        with av.open(str(path), metadata_errors="replace") as container:
-            if not container.streams.video or container.format.name == "tty":  # any text is
-                raise PictureError(f"{path}: holds no video, only sound or text: name a video file")
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            period = 1 / (stream.average_rate or Fraction(25))
-            for number, frame in enumerate(container.decode(stream)):
-                if frame.pts is None or frame.time_base is None:
-                    seconds = number * period
-                else:
-                    seconds = frame.pts * frame.time_base
-                first = seconds if first is None else first
-                time = round((seconds - first) * 1_000_000)
-                if last is not None and not 0 < time - last <= MAX_INTERVAL:
-                    raise PictureError(
-                        f"{path}: picture {number + 1} comes {(time - last) * 1e-6:g} s after the "
-                        f"one before, expected more than 0 and up to {MAX_INTERVAL * 1e-6:.1f}: "
-                        "convert the clip to a constant rate"
-                    )
-                last = time
-                height, width = size or (frame.height, frame.width)
-                # By way of RGB: the grey plane of a video does not reach from 0 to 255.
-                rgb = frame.to_ndarray(format="rgb24", width=width, height=height)
-                grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
-                yield Picture(time, np.round(grey).astype(np.uint8), None)
-    except (FFmpegError, OSError, UnicodeDecodeError) as error:  # names in it that are no text
-        reason = getattr(error, "strerror", None) or error
-        raise PictureError(
-            f"{path}: cannot be read as a video ({reason}): name a file that ffmpeg can play"
-        ) from error

@@ -20,7 +20,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.checkpoint import load_weights
-from firenet_jax.commands.simulate import Picture, write_sequence
 from firenet_jax.errors import RecordingError, SettingsError, logger
 from firenet_jax.evaluation import metrics
 from firenet_jax.evaluation.equalise import equalise
@@ -30,6 +29,7 @@ from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.storage import runs
 from firenet_jax.storage.files import identity, write_text
+from firenet_jax.storage.sequence_file import Picture, write_sequence
 from firenet_jax.tensors import capacity, in_groups, pack, voxelise
 from firenet_jax.training import run as training
 from firenet_jax.training.settings import Train

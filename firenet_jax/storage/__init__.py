@@ -7,6 +7,7 @@ Knows nothing of the network and its data. Read `files` first.
     resume         which outputs are done, and how far an unfinished folder of pictures is
     video          pictures -> a folder of png, mp4, gif
     disk           a file for HDF5 that says when the disk is full
+    sequence_file  events and pictures -> one HDF5 file to train on
     arrays         images -> one HDF5 file of float32
     bag            pictures -> ROS 1 and ROS 2 bags
     pytorch_file   PyTorch's files -> numpy arrays, without running code in them

@@ -1,11 +1,12 @@
 """A folder of HDF5 sequences -> batches for training, of the same type as `sensor.simulate`.
 
-The files have the layout of event_cnn_minimal (see `commands.simulate`), which `firenet simulate`
-writes and the data sets of event_cnn_minimal and ssl_e2vid use. Window t of a batch lasts from one
-image of a file to the next, start <= time < end; these two times are its t_min and t_max in Eq. 1
-(see `tensors`). `images[t]` is the image at its end. The displacement is the flow stored with that
-image times the window's duration, so that `warp(images[t - 1], displacement[t])` is `images[t]`
-where `visible[t]`. Without flow in the file nothing is visible, and the temporal loss is 0.
+The files have the layout of event_cnn_minimal (see `storage.sequence_file`), which the data sets of
+event_cnn_minimal and ssl_e2vid use, and which `firenet simulate` writes. Window t of a batch
+lasts from one image of a file to the next, start <= time < end; these two times are its t_min and
+t_max in Eq. 1 (see `tensors`). `images[t]` is the image at its end. The displacement is the flow
+stored with that image times the window's duration, so that `warp(images[t - 1], displacement[t])`
+is `images[t]` where `visible[t]`. Without flow in the file nothing is visible, and the temporal
+loss is 0.
 
 Batch n depends only on the files, the settings, the seed and n, so a resumed run continues exactly.
 Threads read ahead; events become tensors on the device.
