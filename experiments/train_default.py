@@ -453,12 +453,10 @@ HARDY = replace(
     scene=replace(CLEAR.scene, halt=0.5),
     sensor=replace(CLEAR.sensor, clean=0.15),
 )
-# Tried since, from the built-in weights, side by side, and not built in; their last weights are in
-# results/stages/. Rest in half of the sequences from the start, on dense windows and on all: after
-# 400 windows of much noise their mean keeps brightness within 0.01 and correlates by 0.74 with what
-# was seen (built in: 0.46), but its figures on the model card are worse (SSIM 0.743, 0.736, 0.640,
-# 0.677). A mean of half of the built-in ones and a quarter each of these is in between (0.750,
-# 0.743, 0.655, 0.687; 0.57 after 400). Their first 420 steps ran on a schedule of 1,500.
+# Tried since, from the built-in weights, side by side; in no stage and no mean yet, their last
+# weights are in results/stages/. Rest in half of the sequences from the start, on dense windows and
+# on all: what was seen stays much longer in much noise, but pictures are worse. Their first 420
+# steps ran on a schedule of 1,500.
 SETTLED = replace(
     BARE,
     steps=980,

@@ -1,6 +1,6 @@
 """What goes to disk and how -> files that are whole; and what is shown meanwhile.
 
-Knows nothing of the network and its data. Read `files` first.
+Knows nothing of the network. Read `files` first.
 
     files          each file is made under a name beside its own and renamed when whole; locks
     runs           a folder, its settings, what is done: how an interrupted command goes on
