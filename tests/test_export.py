@@ -260,6 +260,7 @@ def test_pytorch_reads_all_that_a_file_of_ours_may_hold(tmp_path):
     torch = pytest.importorskip("torch", reason="reads with PyTorch, which is not installed")
     content = {
         "none": None, "yes": True, "no": False, "n": -7, "x": 0.1, "text": "grün",
+        "ends": [2**31 - 1, -(2**31)], "long": [2**31, -(2**31) - 1, 2**63, -(2**70)],
         "list": [1, "b", []], "tuple": (1, (2,)), "dict": {"a": {}},
         "scalar": np.float32(3) + np.zeros((), np.float32), "empty": np.zeros((0, 3), np.float32),
         "turned": np.arange(6, dtype=np.float32).reshape(2, 3).T,

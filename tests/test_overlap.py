@@ -11,7 +11,7 @@ def test_gives_the_same_items_in_order():
     assert list(ahead(iter([]))) == []
 
 
-def test_runs_at_most_depth_items_early():
+def test_depth_items_wait_and_one_is_in_hand():
     made = []
 
     def items():
@@ -22,7 +22,7 @@ def test_runs_at_most_depth_items_early():
     stream = ahead(items(), depth=2)
     assert next(stream) == 0
     time.sleep(0.3)
-    assert 3 <= len(made) <= 5  # one taken, two waiting, one in hand
+    assert 3 <= len(made) <= 4  # one taken, two waiting, one in hand
     assert list(stream) == list(range(1, 10))
 
 

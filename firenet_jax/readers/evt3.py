@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firenet_jax.readers import unwrap
+from firenet_jax.readers.vectors import Base, expand
 
 # Sensors fall back to a slightly older time now and then. Falls of up to ten steps of time high are
 # raised to the latest time; the ROS driver's decoder does not take those for a wrap-around either.
@@ -35,8 +36,7 @@ class State(NamedTuple):
     latest: int = -1  # the largest time of all events
     high: int = -1  # the last time high, unwrapped
     y: int = -1
-    base: int = -1  # column of the next vector's bit 0
-    base_on: int = 0  # polarity of the next vector
+    base: Base = Base()  # in columns
 
 
 def decode(state: State, words: np.ndarray) -> tuple[State, tuple[np.ndarray, ...]]:
@@ -51,31 +51,15 @@ def decode(state: State, words: np.ndarray) -> tuple[State, tuple[np.ndarray, ..
     rows = np.append(state.y, load[is_row] & 0x7FF)
     y = rows[np.cumsum(is_row)]
 
-    is_base = kind == 0x3
-    base = np.cumsum(is_base)
-    starts = np.append(state.base, load[is_base] & 0x7FF)
-    polarities = np.append(state.base_on, load[is_base] >> 11)
-    moved = np.cumsum(np.select([kind == 0x4, kind == 0x5], [12, 8], 0))
-    moved -= np.append(0, moved[is_base])[base]  # since the base was set, this word included
-    widths = np.where(kind == 0x5, 8, 12)
-
-    single = kind == 0x2
-    vector = (kind == 0x4) | (kind == 0x5)
+    width = np.select([kind == 0x4, kind == 0x5], [12, 8], 0)
     known = (time >= 0) & (y >= 0)
-    entries = np.flatnonzero(known & (single | vector & (starts[base] >= 0)))
-    # A single event is a vector with one bit, at its own x.
-    single, base = single[entries], base[entries]
-    first = np.where(single, load[entries] & 0x7FF, starts[base] + moved[entries] - widths[entries])
-    on = np.where(single, load[entries] >> 11, polarities[base])
-    bits = np.where(single, 1, load[entries] & (1 << widths[entries]) - 1)
-    entry, bit = np.nonzero(bits[:, None] >> np.arange(12) & 1)
+    base, (word, x, on) = expand(state.base, load, kind == 0x3, kind == 0x2, width, known)
 
-    t = time[entries][entry]
+    t = time[word]
     latest = np.maximum.accumulate(np.append(state.latest, t))
     t = np.where(latest[1:] - t <= JITTER, latest[1:], t)
-    next_base = starts[-1] + (moved[-1] if words.size and starts[-1] >= 0 else 0)
-    state = State(*map(int, (times[-1], latest[-1], high, rows[-1], next_base, polarities[-1])))
-    return state, (t, first[entry] + bit, y[entries][entry], on[entry])
+    state = State(int(times[-1]), int(latest[-1]), high, int(rows[-1]), base)
+    return state, (t, x, y[word], on)
 
 
 def triggers(state: State, words: np.ndarray) -> tuple[State, tuple[np.ndarray, ...]]:

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firenet_jax.readers import unwrap
+from firenet_jax.readers.vectors import Base, expand
 
 EVENT = np.dtype([("data", "<u4"), ("t", "<i4")])
 
@@ -28,8 +29,7 @@ class State(NamedTuple):
     """What a message leaves to the next one; -1: not known yet."""
 
     x: int = -1
-    base: int = -1  # row of the next vector's bit 0
-    base_on: int = 0
+    base: Base = Base()  # in rows
 
 
 def decode(
@@ -53,25 +53,9 @@ def decode(
     columns = np.append(state.x, load[is_column] & 0x7FF)
     x = columns[np.cumsum(is_column)]
 
-    is_base = kind == 4
-    base = np.cumsum(is_base)
-    bases = np.append(state.base, load[is_base] & 0x7FF)
-    polarities = np.append(state.base_on, load[is_base] >> 11)
-    vector, single = kind == 5, kind == 3
-    moved = 8 * np.cumsum(vector)
-    moved -= np.append(0, moved[is_base])[base]  # since the base was set, this word included
-
-    entries = np.flatnonzero((x >= 0) & (single | vector & (bases[base] >= 0)))
-    # A single event is a vector with one bit, at its own row.
-    single, base = single[entries], base[entries]
-    first = np.where(single, load[entries] & 0x7FF, bases[base] + moved[entries] - 8)
-    on = np.where(single, load[entries] >> 11, polarities[base])
-    bits = np.where(single, 1, load[entries] & 0xFF)
-    entry, bit = np.nonzero(bits[:, None] >> np.arange(8) & 1)
-    entries = entries[entry]
-    next_base = bases[-1] + (moved[-1] if words.size and bases[-1] >= 0 else 0)
-    state = State(*map(int, (columns[-1], next_base, polarities[-1])))
-    return state, (time[entries], x[entries], first[entry] + bit, on[entry])
+    width = np.where(kind == 5, 8, 0)
+    base, (word, y, on) = expand(state.base, load, kind == 4, kind == 3, width, x >= 0)
+    return State(int(columns[-1]), base), (time[word], x[word], y, on)
 
 
 def decode_plain(payload: bytes, time_base: int) -> tuple[np.ndarray, ...]:

@@ -12,7 +12,7 @@ _END = object()
 
 
 def ahead(items: Iterator, depth: int = 2) -> Generator:
-    """Yields what `items` yields, computed by a thread at most `depth` items early.
+    """Yields what `items` yields, computed by a thread: `depth` items wait, and one is in hand.
 
     An exception of `items` is raised here, in its place among the items. Closing this iterator
     (or leaving the loop over it) ends the thread and closes `items`.

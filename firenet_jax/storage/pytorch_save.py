@@ -22,8 +22,8 @@ EMPTY_DICT = b"ccollections\nOrderedDict\n)R"
 
 
 def pytorch_file(content: dict) -> bytes:
-    """The whole file. Raises TypeError for arrays that are not float32 and for other types than
-    those above."""
+    """The whole file. Raises TypeError for arrays that are not float32, and for other types than
+    those above; struct.error for integers of more than 255 bytes."""
     storages: list[np.ndarray] = []
     pickled = PROTOCOL + _pickled(content, storages) + STOP
     stream = io.BytesIO()
@@ -53,8 +53,11 @@ def _pickled(value, storages: list[np.ndarray]) -> bytes:
                 return NONE
             case bool():
                 return TRUE if value else FALSE
-            case int():
+            case int() if -(2**31) <= value < 2**31:
                 return b"J" + struct.pack("<i", value)
+            case int():
+                number = value.to_bytes(value.bit_length() // 8 + 1, "little", signed=True)
+                return b"\x8a" + struct.pack("<B", len(number)) + number
             case float():
                 return b"G" + struct.pack(">d", value)
             case str():
