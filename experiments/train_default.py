@@ -504,6 +504,35 @@ BARING = replace(
     scene=replace(BARE.scene, halt=0.2, pause=0.1),
     sensor=replace(BARE.sensor, clean=0.75),
 )
+# Tried since; in no stage and no mean yet, their last weights are in results/stages/: detail in
+# dense windows, which can be learnt at the price of contrast, from the mean of "baring" and
+# HARDIER; and contrast again, from "keen".
+KEEN = replace(
+    BARE,
+    steps=1000,
+    chain=10,
+    motion=(3.0, 24.0),
+    seed=231,
+    validate_every=100,
+    loss=replace(
+        CLEAR.loss, l1=0.5, centred=0.5, contrast=2.0, ssim=1.0, equalised=6.0, lambda_tc=1.5
+    ),
+    scene=replace(BARE.scene, pause=0.1, halt=0.1),
+    sensor=replace(BARE.sensor, clean=0.8),
+)
+VIVID = replace(
+    CLEAR,
+    steps=700,
+    chain=20,
+    motion=(1.5, 24.0),
+    slow=0.1,
+    warmup=20,
+    seed=239,
+    validate_every=100,
+    loss=replace(CLEAR.loss, contrast=6.0, ssim=1.3, equalised=5.0),
+    scene=replace(CLEAR.scene, halt=0.25),
+    sensor=replace(CLEAR.sensor, clean=0.6),
+)
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
