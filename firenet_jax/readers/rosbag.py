@@ -19,7 +19,7 @@ Messages are decoded from their bytes: ROS 1 packs fields, ROS 2 (CDR) aligns ea
 
 import contextlib
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import chain
 from os.path import commonprefix
@@ -296,49 +296,43 @@ def _mono(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, .
 
 
 def _evt3(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, ...]]]:
-    """Message by message up to the first event, whose stamp counts; then many at once."""
-    state, waiting, started, order = evt3.State(), bytearray(), False, "<"
-    damage = None
-    try:
-        for packet in packets:
-            waiting += packet.payload
-            order = packet.words
-            if started and len(waiting) < 2 * WORDS:
-                continue
-            state, columns = evt3.decode(state, np.frombuffer(bytes(waiting), order + "u2"))
-            waiting, started = bytearray(), started or len(columns[0]) > 0
-            yield packet.stamp, columns
-    except Exception as error:  # damage, of any kind: raised below, after what precedes it
-        damage = error
-    yield 0, evt3.decode(state, np.frombuffer(bytes(waiting), order + "u2"))[1]
-    if damage is not None:
-        raise damage
+    def decode(state: evt3.State, some: list[_Packet]):
+        payload = b"".join(packet.payload for packet in some)
+        return evt3.decode(state, np.frombuffer(payload, some[-1].words + "u2"))
+
+    return _many_at_once(packets, evt3.State(), decode)
 
 
 def _libcaer_cmp(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, ...]]]:
-    """Message by message up to the first event, whose stamp counts; then many at once."""
-    state, waiting, count, started = libcaer.State(), [], 0, False
-    damage = None
-
-    def decode():
-        words = [np.frombuffer(packet.payload, packet.words + "u2") for packet in waiting]
+    def decode(state: libcaer.State, some: list[_Packet]):
+        words = [np.frombuffer(packet.payload, packet.words + "u2") for packet in some]
         starts = np.cumsum([0, *map(len, words)])[:-1]
-        bases = np.array([_to_microseconds(packet.time_base) for packet in waiting], np.int64)
+        bases = np.array([_to_microseconds(packet.time_base) for packet in some], np.int64)
         return libcaer.decode(state, np.concatenate(words).astype(np.uint16), starts, bases)
 
+    return _many_at_once(packets, libcaer.State(), decode)
+
+
+def _many_at_once(
+    packets: Iterator[_Packet], state: Any, decode: Callable
+) -> Iterator[tuple[int, tuple[np.ndarray, ...]]]:
+    """Message by message up to the first event, whose stamp counts; then many at once.
+
+    decode: (state, packets) -> (state after them, columns)"""
+    waiting, size, started, damage = [], 0, False, None
     try:
         for packet in packets:
             waiting.append(packet)
-            count += len(packet.payload)
-            if started and count < 2 * WORDS:
+            size += len(packet.payload)
+            if started and size < 2 * WORDS:
                 continue
-            state, columns = decode()
-            waiting, count, started = [], 0, started or len(columns[0]) > 0
+            state, columns = decode(state, waiting)
+            waiting, size, started = [], 0, started or len(columns[0]) > 0
             yield packet.stamp, columns
     except Exception as error:  # damage, of any kind: raised below, after what precedes it
         damage = error
     if waiting:
-        yield 0, decode()[1]
+        yield 0, decode(state, waiting)[1]
     if damage is not None:
         raise damage
 
