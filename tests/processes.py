@@ -45,23 +45,28 @@ def together(script, *arguments, processes=2, **more):
 
 
 # The libraries are imported before the limit is set: they write files of their own.
-LIMITED = """
-import json, resource, sys
+RUN = """
+import json, os, resource, shutil, sys
 import h5py, jax, orbax.checkpoint
 from firenet_jax import cli
-for limit, line in json.loads(sys.argv[1]):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+def run(line):
     code = cli.main(line.split())
     resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    print(f"exit code {code}", file=sys.stderr, flush=True)
+    left = [
+        os.path.relpath(path, ".")
+        for folder, folders, files in os.walk(".")
+        for path in (os.path.join(folder, name) for name in folders + files)
+        if not os.path.islink(path)
+    ]
+    print(f"exit code {code} {json.dumps(left)}", file=sys.stderr, flush=True)
 """
-
-
+LIMITED = f"""{RUN}
+for limit, line in json.loads(sys.argv[1]):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+    run(line)
+"""
 # A disk of 1 MB, filled up but for so many bytes, whole pages; what the commands read lies outside.
-ON_A_DISK = """
-import json, os, shutil, sys
-import h5py, jax, orbax.checkpoint
-from firenet_jax import cli
+ON_A_DISK = f"""{RUN}
 inputs, disk = os.getcwd(), sys.argv[2]
 os.chdir(disk)
 for room, line in json.loads(sys.argv[1]):
@@ -72,41 +77,35 @@ for room, line in json.loads(sys.argv[1]):
     state = os.statvfs(disk)
     with open("filler", "wb") as file:
         file.write(bytes((state.f_bavail - room // state.f_frsize) * state.f_frsize))
-    code = cli.main(line.split())
-    left = [path for path in os.listdir(disk) if not os.path.islink(path) and path != "filler"]
-    print(f"exit code {code} {json.dumps(left)}", file=sys.stderr, flush=True)
+    run(line)
 """
 MOUNTED = 'mount -t tmpfs -o size=1m none "$2" && exec "$0" -c "$3" "$1" "$2"'
 
 
 def with_little_room(folder, *lines, disk=None):
-    """(bytes there are room for, command line), ... -> [(exit code, lines said), ...].
+    """(bytes there are room for, command line), ... -> [(exit code, lines said, paths left), ...].
 
     One process runs them all, which compiles their programs once. A limit of a file's size stands
     for a full disk: it needs no rights, and the libraries in C meet it where they write. disk: a
-    folder where a real one of 1 MB is mounted instead, for the commands alone; each exit code
-    then comes with the names that are left there.
+    folder where a real one of 1 MB is mounted instead, for the commands alone. Paths left are
+    those in the folder or on the disk after a command, but for links.
     """
     command = [sys.executable, "-c", LIMITED, json.dumps(lines)]
-    if disk is not None:
+    environment = os.environ | FEW_OPTIMISATIONS | {"JAX_PLATFORMS": "cpu"}
+    if disk is None:  # the limit would hold for the files of compiled programs that tests share
+        environment["JAX_ENABLE_COMPILATION_CACHE"] = "false"
+    else:
         shell = ["unshare", "-rm", "sh", "-c", MOUNTED]
         command = [*shell, sys.executable, json.dumps(lines), str(disk), ON_A_DISK]
     ran = subprocess.run(
-        command,
-        cwd=folder, capture_output=True, text=True, timeout=900,
-        # The limit would hold for the files of compiled programs that tests share, too.
-        env=os.environ | FEW_OPTIMISATIONS | {
-            "JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false",
-        },
-    )  # fmt: skip
+        command, cwd=folder, capture_output=True, text=True, timeout=900, env=environment
+    )
     assert ran.returncode == 0, ran.stderr[-2000:]
     results, said = [], []
     for line in ran.stderr.strip().splitlines():
         if line.startswith("exit code "):
             code, _, left = line.removeprefix("exit code ").partition(" ")
-            results.append(
-                (int(code), said) if disk is None else (int(code), said, json.loads(left))
-            )
+            results.append((int(code), said, json.loads(left)))
             said = []
         else:
             said.append(line)
