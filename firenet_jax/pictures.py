@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr  # not norm.cdf, the same: scipy.stats takes half a second to import
 
 from firenet_jax.errors import SettingsError
 
@@ -74,7 +74,7 @@ def _unsharp_weights() -> np.ndarray:
     Not quite a Gaussian of sigma 1: the square root of the outer product of a normal
     distribution's masses in five cells between -1.3 and 1.3.
     """
-    masses = np.diff(norm.cdf(np.linspace(-1.3, 1.3, 6)))
+    masses = np.diff(ndtr(np.linspace(-1.3, 1.3, 6)))
     weights = np.sqrt(masses)
     return (weights / weights.sum()).astype(np.float32)
 

@@ -2,6 +2,7 @@
 data outside the repository, and which tests run in one process (`-n 2`).
 """
 
+import gc
 import os
 import shutil
 import tempfile
@@ -25,7 +26,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
-from processes import OLD_EMITTERS  # noqa: E402
+from processes import COLLECTED_AFTER, OLD_EMITTERS  # noqa: E402
+
+gc.set_threshold(COLLECTED_AFTER)
 
 # XLA reads its flags once, at the first device. What tests start has XLA's own emitters, as users
 # have, but for programs that say otherwise (`processes.FEW_OPTIMISATIONS`).
