@@ -14,17 +14,12 @@ OLD_EMITTERS = "--xla_cpu_use_fusion_emitters=false" if version("jax").startswit
 # For what does not depend on how well XLA optimises: it compiles in a fifth of the time.
 FEW_OPTIMISATIONS = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "XLA_FLAGS": OLD_EMITTERS}
 
-# Objects that are made before Python looks for circles of them (700 by default): JAX traces with
-# millions, and a seventh of the time of a short training is spent on looking.
-COLLECTED_AFTER = 20_000
-SELDOM = f"import gc; gc.set_threshold({COLLECTED_AFTER})\n"
-
 
 def start(script, *arguments, devices=1, **more):
     count = f"--xla_force_host_platform_device_count={devices}"
     more["XLA_FLAGS"] = f"{more.get('XLA_FLAGS', '')} {count}"
     environment = os.environ | more | {"JAX_PLATFORMS": "cpu"}
-    command = [sys.executable, "-c", SELDOM + script, *map(str, arguments)]
+    command = [sys.executable, "-c", script, *map(str, arguments)]
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
 
 
@@ -65,13 +60,13 @@ def run(line):
     ]
     print(f"exit code {code} {json.dumps(left)}", file=sys.stderr, flush=True)
 """
-LIMITED = f"""{SELDOM}{RUN}
+LIMITED = f"""{RUN}
 for limit, line in json.loads(sys.argv[1]):
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
     run(line)
 """
 # A disk of 1 MB, filled up but for so many bytes, whole pages; what the commands read lies outside.
-ON_A_DISK = f"""{SELDOM}{RUN}
+ON_A_DISK = f"""{RUN}
 inputs, disk = os.getcwd(), sys.argv[2]
 os.chdir(disk)
 for room, line in json.loads(sys.argv[1]):
