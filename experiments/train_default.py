@@ -556,6 +556,45 @@ SERENE = replace(
     scene=replace(BARE.scene, pause=0.1, halt=0.2),
     sensor=replace(BARE.sensor, clean=0.7),
 )
+# From what is built in. The same little flicker without losing memory: sequences of up to 400
+# windows keep it, but contrast is lost all the same.
+ABIDING = replace(
+    CLEAR,
+    steps=1300,
+    motion=(1.5, 24.0),
+    slow=0.1,
+    learning_rate=1e-3,
+    warmup=20,
+    seed=257,
+    validate_every=100,
+    loss=replace(CLEAR.loss, l1=0.7, centred=0.8, ssim=1.3, equalised=4.0, lambda_tc=11.0),
+    scene=replace(CLEAR.scene, halt=0.35),
+    sensor=replace(CLEAR.sensor, clean=0.55),
+)
+# From what is built in. First windows above all, mostly faulty: the best of all on the card and
+# against cameras' frames, which begin with nothing seen; what it has seen does not last.
+WAKING = replace(
+    CLEAR,
+    steps=420,
+    chain=2,
+    motion=(1.0, 16.0),
+    slow=0.1,
+    learning_rate=1e-3,
+    warmup=20,
+    seed=263,
+    validate_every=100,
+    loss=replace(
+        CLEAR.loss,
+        l1=0.7,
+        centred=0.8,
+        contrast=6.0,
+        ssim=1.3,
+        equalised=5.0,
+        equalised_mse=24.0,
+    ),
+    scene=replace(CLEAR.scene, pause=0.1, halt=0.1),
+    sensor=replace(CLEAR.sensor, clean=0.25),
+)
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
