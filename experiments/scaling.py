@@ -162,10 +162,9 @@ def on_devices(recordings: int, events: int) -> list[dict]:
             size = f"{POINT['width']} {POINT['height']}\n"
             (folder / f"r{number}.txt").write_text(size + lines)
         for devices, processes in ((1, 1), (2, 1), (4, 1), (1, 2)):
-            environment = os.environ | {
-                "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
-                "JAX_PLATFORMS": "cpu",
-            }
+            count = f"--xla_force_host_platform_device_count={devices}"
+            flags = f"{os.environ.get('XLA_FLAGS', '')} {count}"
+            environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
             command = [sys.executable, "-c", DEVICES, folder, folder / f"out{devices}{processes}"]
             started = [
                 subprocess.Popen(
