@@ -571,8 +571,8 @@ ABIDING = replace(
     scene=replace(CLEAR.scene, halt=0.35),
     sensor=replace(CLEAR.sensor, clean=0.55),
 )
-# From what is built in. First windows above all, mostly faulty: the best of all on the card and
-# against cameras' frames, which begin with nothing seen; what it has seen does not last.
+# From what is built in. First windows above all, mostly faulty: less error on the card and against
+# cameras' frames, which begin with nothing seen; but what it has seen does not last.
 WAKING = replace(
     CLEAR,
     steps=420,
