@@ -51,7 +51,7 @@ def of_windows(weights, recording, windows: Windows) -> dict[int, np.ndarray]:
 
 
 def at(weights, recording, windows: Windows, times) -> dict[int, np.ndarray]:
-    series = images_at(weights, recording, times, longest=windows.longest)
+    series = images_at(weights, recording, times, warm_up=0, longest=windows.longest)
     return {t: image for some, images in series for t, image in zip(some.tolist(), images)}  # noqa: B905
 
 

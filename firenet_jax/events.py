@@ -7,7 +7,7 @@ seconds lose microseconds after 16 s. A recording is a stream of `Events` chunks
 
 import bisect
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, overload
 
@@ -34,6 +34,13 @@ class Events:
     def select(self, index) -> "Events":
         """The events that a slice, a mask or an index array picks."""
         return Events(self.t[index], self.x[index], self.y[index], self.p[index])
+
+    def backwards(self) -> "Events":
+        """The same seen in reversed time: what became brighter becomes darker."""
+        back = self.select(slice(None, None, -1))
+        if len(self):
+            back = replace(back, t=self.t[0] + (self.t[-1] - back.t), p=~back.p)
+        return back
 
     @classmethod
     def of(cls, t, x, y, p) -> "Events":

@@ -13,8 +13,13 @@ so far, from the state (1 - s) S[k-1] + s S[k], roughly the state at the start o
 s = 0 this is the step that keeps W[k], for s = 1 the one that keeps W[k+1], so images change
 smoothly across kept steps. No image depends on which others are requested, or on the future. (A
 look at the part of W[k+1] alone, from S[k], would have hardly any events just after a kept window.)
+
+A network that has seen nothing is grey. As a recording is there as a whole, the network can be
+shown its first windows beforehand, forwards and then backwards in time (`warming`): then it is back
+at the beginning, with a state that knows the scene.
 """
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -27,6 +32,8 @@ from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.events import Events, Recording, concatenate
 from firenet_jax.windows import Window, Windows, cut
 
+WARM_UP = 20  # windows
+MOST_WARMING = 8.0  # events per pixel, slightly more than twenty usual windows
 MAX_RATE = 1_000_000  # images per second: times are whole microseconds
 
 
@@ -52,23 +59,24 @@ def steps(
     recording: Recording,
     windows: Windows,
     times: Iterable[int],
-    chunks: Iterable[Events] | None = None,
+    cutter: Iterable[Window] | None = None,
     counts: Counts | None = None,
 ) -> Iterator[Step]:
     """Recording, times -> the steps that give an image at each time, and the kept ones in between.
 
     times: microseconds on the recording's clock, in order; may be endless. Times before the first
     event or after the last one get no image. An image at t has seen all events up to and at t.
-    chunks: the recording's events after filters; None: unfiltered. counts: filled in.
+    cutter: the recording's windows; None: those that `windows` cut. counts: filled in.
     Raises SettingsError for windows that overlap or lie between frames, and RecordingError as `cut`
     does, after the steps up to the damage.
     """
     check(windows)
+    cutter = cut(recording, windows) if cutter is None else cutter
     counts = Counts() if counts is None else counts
     endless, times = isinstance(times, Grid), _in_order(times)
     time = next(times, None)
     before = Events.empty()
-    for window, begin, end in _spans(windows, cut(recording, windows, chunks)):
+    for window, begin, end in _spans(windows, iter(cutter)):
         while time is not None and time < begin:  # only before the first window
             counts.early += 1
             time = next(times, None)
@@ -80,6 +88,37 @@ def steps(
         before = window.events
     if time is not None and not endless:
         counts.late += 1 + sum(1 for _ in times)
+
+
+def warming(
+    cutter: Iterable[Window], pixels: int, count: int = WARM_UP
+) -> tuple[list[Step], Iterator[Window]]:
+    """Windows -> (the first `count` of them as steps, forwards and then backwards in time; all
+    windows again).
+
+    Fewer, but one, if they hold more than 8 events per pixel: they are kept in memory. An error of
+    the windows is raised where it was.
+    """
+    cutter = iter(cutter)
+    seen: list[Window] = []
+    damage = None
+    try:
+        for window in itertools.islice(cutter, count):
+            seen.append(window)
+            if sum(len(window.events) for window in seen) > MOST_WARMING * pixels:
+                break
+    except RecordingError as error:
+        damage = error
+
+    def again() -> Iterator[Window]:
+        yield from seen
+        if damage is not None:
+            raise damage
+        yield from cutter
+
+    forwards = [window.events for window in seen]
+    backwards = [events.backwards() for events in reversed(forwards)]
+    return [Step(events, None, 1.0) for events in forwards + backwards], again()
 
 
 def _in_order(times: Iterable[int]) -> Iterator[int]:

@@ -6,6 +6,7 @@ recording can be streamed in chunks of any T. B recordings of different lengths 
 are steps whose new state is discarded (instants.py).
 """
 
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -19,7 +20,7 @@ from jax.sharding import Mesh
 from firenet_jax import colour, native
 from firenet_jax.devices import BATCH, REPLICATED, TIME_BATCH, on_each_device
 from firenet_jax.events import Events, Recording, check_recording
-from firenet_jax.instants import Step, steps
+from firenet_jax.instants import WARM_UP, Step, check, steps, warming
 from firenet_jax.network import (
     BINS,
     CHANNELS,
@@ -45,7 +46,7 @@ from firenet_jax.tensors import (
     pack,
     voxelise,
 )
-from firenet_jax.windows import Windows, usual
+from firenet_jax.windows import Windows, cut, usual
 
 
 @dataclass(frozen=True)
@@ -309,6 +310,7 @@ def images_at(
     times: Iterable[int],
     *,
     chunk: int = 8,
+    warm_up: int = WARM_UP,
     **windows,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Recording, times -> chunks of (times (n,) int64, images (n, H, W) float32).
@@ -319,16 +321,22 @@ def images_at(
     pixel, at most 40 ms, as in `firenet reconstruct`. An image depends on these and on the events
     up to its time, not on which other times are requested.
     chunk: steps per call of the device. Memory holds one chunk, whatever the recording's length.
+    warm_up: windows of the beginning that the network sees beforehand, see `instants.warming`.
     Raises ValueError for invalid windows, RecordingError if the file is damaged.
     """
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but must be 1 or more steps")
+    if warm_up < 0:
+        raise ValueError(f"warm_up is {warm_up}, but must be 0 or more windows")
     check_recording(recording)
     chosen = Windows(**windows) if windows else usual(recording.events())
+    check(chosen)
     height, width, size = recording.height, recording.width, 0
     state = initial_state(1, height, width)
     committed = Committed(state, state)
-    for group in in_groups(steps(recording, chosen, times), chunk):
+    first, cutter = warming(cut(recording, chosen), recording.pixels, warm_up)
+    entries = itertools.chain(first, steps(recording, chosen, times, cutter))
+    for group in in_groups(entries, chunk):
         rows = [[step.events] for step in group] + [[Events.empty()]] * (chunk - len(group))
         size = capacity(sum(len(row[0]) for row in rows), size)
         tensors = voxelise(pack(rows, size), height=height, width=width)

@@ -364,7 +364,7 @@ def test_images_at_frame_times_are_those_of_images_at(folder, tmp_path):
         entry = results["sequences"]["a"]["methods"]["ours"]
         # One step at a time, as here: where votes cancel, a sum in another order is not zero.
         weights = load_weights(folder / "ours.npz")
-        found = list(images_at(weights, recording, times, chunk=1, **choice))
+        found = list(images_at(weights, recording, times, chunk=1, warm_up=0, **choice))
         taken, images = (np.concatenate(column) for column in zip(*found, strict=True))
         numbers = np.searchsorted(times, taken)
         counting = numbers > 0  # as of windows between frames, which the first has none of

@@ -8,11 +8,11 @@ from test_tensors import random_events
 from firenet_jax import native
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Recording
-from firenet_jax.instants import Counts, Grid, grid, steps
+from firenet_jax.instants import Counts, Grid, grid, steps, warming
 from firenet_jax.network import Weights, initial_params, initial_state, step
 from firenet_jax.reconstruction import Committed, Looks, images_at, reconstruct, reconstruct_at
 from firenet_jax.tensors import normalise, pack, voxelise
-from firenet_jax.windows import Windows, cut
+from firenet_jax.windows import Window, Windows, cut
 
 HEIGHT, WIDTH = 12, 17
 FIRST = 10**15
@@ -121,7 +121,8 @@ def test_damage_is_told_after_what_came_before_it(recording):
 
     found = []
     with pytest.raises(RecordingError, match="here"):
-        for entry in steps(recording, Windows(events=90), Grid(FIRST, 1000), damaged()):
+        windows = cut(recording, Windows(events=90), damaged())
+        for entry in steps(recording, Windows(events=90), Grid(FIRST, 1000), windows):
             found.append(entry)
     kept = [s for s in found if s.time is None]
     assert len(kept) == 7 and len([s for s in found if s.time]) > 7
@@ -140,6 +141,54 @@ def test_no_events_and_windows_without_any():
     found = list(steps(recording_of(events), Windows(duration=2), FIRST + np.arange(0, 9001, 1000)))
     assert len([s for s in found if s.time is None]) == 5
     assert [len(s.events) for s in found if s.time] == [1, 2, 2, 1, 0, 0, 0, 0, 0, 1]
+
+
+def test_the_beginning_is_shown_forwards_and_backwards(recording):
+    windows = list(cut(recording, Windows(events=90)))
+    first, again = warming(iter(windows), 10**6, 3)
+    assert list(again) == windows
+    assert [(step.time, step.share) for step in first] == [(None, 1.0)] * 6
+    shown = [voxelise(pack([[s.events]]), height=HEIGHT, width=WIDTH)[0, 0] for s in first]
+    for k in range(3):
+        assert first[k].events is windows[k].events
+        events, back = windows[k].events, first[5 - k].events
+        assert (
+            back.t[0] == events.t[0] and back.t[-1] == events.t[-1] and (np.diff(back.t) >= 0).all()
+        )
+        np.testing.assert_allclose(shown[5 - k], -shown[k][..., ::-1], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "pixels, count, expected", [(10**6, 0, 0), (10**6, 99, 8), (33, 99, 3), (1, 99, 1)]
+)
+def test_no_more_of_the_beginning_is_kept_than_memory_should_hold(
+    recording, pixels, count, expected
+):
+    """8 windows of 90 events; 8 events per pixel are 264 for 33 pixels."""
+    assert len(warming(cut(recording, Windows(events=90)), pixels, count)[0]) == 2 * expected
+
+
+def test_damage_of_the_beginning_is_told_after_what_came_before_it():
+    def damaged():
+        yield 1
+        yield 2
+        raise RecordingError("here")
+
+    def windows():
+        for number in damaged():
+            yield Window(Events.of([number], [0], [0], [1]), number)
+
+    first, again = warming(windows(), 10**6, 20)
+    assert [int(step.events.t[0]) for step in first] == [1, 2, 2, 1]
+    assert [next(again).time, next(again).time] == [1, 2]
+    with pytest.raises(RecordingError, match="here"):
+        next(again)
+
+
+def test_there_may_be_no_beginning():
+    first, again = warming(cut(recording_of(Events.empty()), Windows(events=9)), 100, 20)
+    assert first == [] and list(again) == []
+    assert len(Events.empty().backwards()) == 0
 
 
 # ---- Images
@@ -177,7 +226,7 @@ def test_images_are_those_of_single_steps(weights, recording, machine_code, monk
         monkeypatch.setenv("FIRENET_NATIVE", "0")
         jax.clear_caches()
     times = np.arange(FIRST + 3000, FIRST + 45_000, 3501)
-    found = list(images_at(weights, recording, times, chunk=5, events=90))
+    found = list(images_at(weights, recording, times, chunk=5, warm_up=0, events=90))
     if not machine_code:
         jax.clear_caches()
     assert np.concatenate([t for t, _ in found]).tolist() == times.tolist()
@@ -198,6 +247,32 @@ def test_an_image_does_not_depend_on_the_others_that_are_asked_for(weights, reco
         assert len(common) >= 3
         for time in common:
             np.testing.assert_allclose(found[200, 8][time], found[other][time], atol=1e-6)
+
+
+def test_images_after_the_warm_up_are_those_of_a_state_that_has_seen_the_beginning(
+    weights, recording
+):
+    """In tensors: the bins the other way round, the votes negated."""
+    tensors = [
+        voxelise(pack([[window.events]]), height=HEIGHT, width=WIDTH)
+        for window in cut(recording, Windows(events=90))
+    ]
+    state = initial_state(1, HEIGHT, WIDTH)
+    for tensor in [*tensors[:4], *(-tensor[..., ::-1] for tensor in reversed(tensors[:4]))]:
+        state, _ = reconstruct(weights, state, tensor)
+    wanted = []
+    for tensor in tensors:
+        state, image = reconstruct(weights, state, tensor)
+        wanted.append(image[0, 0])
+    # at the ends of windows a look is the step that keeps them
+    ends = [int(window.events.t[-1]) for window in cut(recording, Windows(events=90))]
+    keeping = np.flatnonzero(np.diff([*ends, ends[-1] + 1]) > 0)
+    starts = [int(window.events.t[0]) for window in cut(recording, Windows(events=90))]
+    clear = [k for k in keeping if k + 1 == len(ends) or starts[k + 1] > ends[k]]
+    found = images_at(weights, recording, [ends[k] for k in clear], chunk=3, warm_up=4, events=90)
+    images = np.concatenate([images for _, images in found])
+    assert len(clear) >= 4
+    np.testing.assert_allclose(images[:-1], np.stack(wanted)[clear][:-1], atol=2e-5)
 
 
 def test_recordings_side_by_side_and_steps_that_are_not_there(weights):
@@ -246,5 +321,7 @@ def test_nothing_recompiles_as_data_flows(weights, recording):
 def test_impossible_choices(weights, recording):
     with pytest.raises(ValueError, match="chunk is 0"):
         next(images_at(weights, recording, [1], chunk=0))
+    with pytest.raises(ValueError, match="warm_up is -1"):
+        next(images_at(weights, recording, [1], warm_up=-1))
     with pytest.raises(ValueError, match="given times"):
         next(images_at(weights, recording, [1], between_frames=True))

@@ -8,16 +8,18 @@ import threading
 from pathlib import Path
 
 import av
+import h5py
 import jax
 import numpy as np
 import pytest
 from PIL import Image
 from processes import finish, start
 
+import firenet_jax as fj
 from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.commands import jobs, reconstruct
 from firenet_jax.commands.reconstruct import Reconstruct, describe, plan, run
-from firenet_jax.errors import RecordingError
+from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
@@ -71,6 +73,27 @@ def test_a_recording_becomes_a_folder_of_pictures(tmp_path, weights, capsys):
     assert stamps.split() == times[99::100] + times[-1:]
     assert "31 pictures of 3,050 events" in capsys.readouterr().out
     assert not list(tmp_path.glob("*.partial*"))
+
+
+def test_the_first_pictures_are_of_a_network_that_has_seen_the_beginning(tmp_path, weights, capsys):
+    """As by hand: ten windows forwards, then backwards in time, then all of them."""
+    path = write_recording(tmp_path / "a.txt", 1550)
+    choices = {"windows": Windows(events=100), "warm_up": 10, "batch": 1}
+    run(settings(weights, (path,), tmp_path / "a.h5", **choices))
+    assert "16 pictures of 1,550 events" in capsys.readouterr().out
+    chunks = fj.event_tensors(open_recording(path), events=100, chunk=1)
+    tensors = np.concatenate([tensors for tensors, _ in chunks])
+    shown = np.concatenate([tensors[:10], -tensors[:10][::-1, ..., ::-1], tensors])
+    state = fj.initial_state(1, HEIGHT, WIDTH)
+    wanted = fj.reconstruct(load_weights(weights), state, shown)[1][20:, 0]
+    with h5py.File(tmp_path / "a.h5") as file:
+        np.testing.assert_allclose(file["images"], wanted, atol=1e-5)
+    run(settings(weights, (path,), tmp_path / "cold.h5", **(choices | {"warm_up": 0})))
+    with h5py.File(tmp_path / "cold.h5") as file:
+        cold = fj.reconstruct(load_weights(weights), state, tensors)[1][:, 0]
+        np.testing.assert_allclose(file["images"], cold, atol=1e-5)
+    with pytest.raises(SettingsError, match="warm-up is -1"):
+        settings(weights, (path,), tmp_path / "out", warm_up=-1)
 
 
 @pytest.mark.parametrize("batch", [1, 2, 3])

@@ -26,7 +26,7 @@ from tqdm import tqdm
 from firenet_jax.devices import BATCH, REPLICATED, device_mesh, sharding
 from firenet_jax.errors import RecordingError, logger
 from firenet_jax.events import Events, Recording, counted
-from firenet_jax.instants import Counts, Grid, Step, steps
+from firenet_jax.instants import Counts, Grid, Step, steps, warming
 from firenet_jax.network import Weights
 from firenet_jax.pictures import Display
 from firenet_jax.reconstruction import (
@@ -62,6 +62,7 @@ class Job(NamedTuple):
     times: np.ndarray | Grid | None  # of the images; None: one per window
     events: Callable[[], Iterator[Events]]  # after all filters
     writer: Callable[[], Writer]  # opens the output
+    warm_up: int = 0  # windows of its beginning that the network sees beforehand
 
 
 class Way(NamedTuple):
@@ -103,6 +104,7 @@ class Running:
     writer: Writer
     steps: Iterator[Step] = iter(())
     ahead: Step | None = None  # the next step; None after the last
+    warming: int = 0  # so many of its first steps are the warm-up
     reached: int = 0  # steps taken so far, those of an earlier run among them
     pictures: int = 0  # of these
     events: int = 0  # read so far, by this run
@@ -225,12 +227,19 @@ def in_chunks(
                     outcome.failed[job.output] = error
         if not running:
             return
-        rows = [[Events.empty()] * slots for _ in range(length)]
+        rows, count = [[Events.empty()] * slots for _ in range(length)], 0
         valid = np.zeros((length, slots), bool)
         parts: dict[int, Part] = {}
         taken: list[list[Step]] = [[] for _ in range(slots)]
         for slot, one in list(running.items()):
+            skipped = max(one.warming - one.reached, 0)
             taken[slot] = one.take(length)
+            # Of images at times, events count in the step that keeps them.
+            count += sum(
+                len(step.events)
+                for step in taken[slot][skipped:]
+                if not way.at_times or step.time is None
+            )
             for t, step in enumerate(taken[slot]):
                 rows[t][slot] = step.events
             valid[: len(taken[slot]), slot] = True
@@ -240,9 +249,6 @@ def in_chunks(
             parts[slot] = Part(one, times, sizes, one.reached, one.pictures, ends)
             if ends:
                 del running[slot]
-        # Of images at times, events count in the step that keeps them.
-        counting = (step for group in taken for step in group)
-        count = sum(len(s.events) for s in counting if not way.at_times or s.time is None)
         events = pack_for_devices(rows, devices, size)
         size = len(events.t) // devices
         looks = looks_of(taken, length) if way.at_times else None
@@ -263,13 +269,14 @@ def start(job: Job, way: Way, opened: dict[Path, Writer]) -> tuple[Running, Sess
     writer = opened[job.output] = job.writer()
     running = Running(job, writer)
     try:
-        chunks = running.counting(job.events())
+        windows = cut(job.recording, job.windows, running.counting(job.events()))
+        first, windows = warming(windows, job.recording.pixels, job.warm_up)
         if job.times is None:
-            windows = cut(job.recording, job.windows, chunks)
-            running.steps = (Step(window.events, window.time, 1.0) for window in windows)
+            entries = (Step(window.events, window.time, 1.0) for window in windows)
         else:
             running.counts, times = Counts(), copy.copy(job.times)  # a grid counts on
-            running.steps = steps(job.recording, job.windows, times, chunks, running.counts)
+            entries = steps(job.recording, job.windows, times, windows, running.counts)
+        running.steps, running.warming = itertools.chain(first, entries), len(first)
         running.reached, running.pictures, session = position(job, way)
         running.ahead = next(itertools.islice(running.steps, running.reached, None), None)
         if running.ahead is None and not running.reached:
@@ -352,7 +359,7 @@ def computed(
             states = {
                 slot: _get_slot(session, slot)
                 for slot, part in chunk.parts.items()
-                if isinstance(part.running.writer, FolderWriter) and not part.ends
+                if isinstance(part.running.writer, FolderWriter) and part.pictures and not part.ends
             }
             kept = time.monotonic()
         sent.append((chunk, shown, states))

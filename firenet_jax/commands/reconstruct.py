@@ -22,7 +22,7 @@ from firenet_jax.commands.times import Times, times_of
 from firenet_jax.devices import share
 from firenet_jax.errors import RecordingError, SettingsError, logger
 from firenet_jax.events import Events, Recording, counted, rate_in_words, until_damage
-from firenet_jax.instants import Grid, check
+from firenet_jax.instants import WARM_UP, Grid, check
 from firenet_jax.network import Weights
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
@@ -80,6 +80,9 @@ class Reconstruct:
     times: Times = Times()
     display: Display = Display()
     network: Network = Network()
+    warm_up: int = WARM_UP
+    """First show the network this many windows of the beginning, forwards and then backwards in
+    time, so that it starts with a picture. 0: it starts with nothing, and grey, as in the paper."""
     preview: bool = False
     """Show the events (blue: brighter, red: darker) next to the reconstruction."""
     show: bool = False
@@ -141,6 +144,8 @@ class Reconstruct:
                 f"chunk is {self.chunk or 1} and batch {self.batch or 1}, but fewer than 32768 "
                 "windows fit at once"
             )
+        if self.warm_up < 0:
+            raise SettingsError(f"warm-up is {self.warm_up}, but must be 0 or more windows")
         if self.network.pad < 1:
             raise SettingsError(f"pad is {self.network.pad}, but pads to a multiple of 1 or more")
         if not self.recordings:
@@ -285,6 +290,7 @@ def job_of(
         times=times,
         events=lambda: filtered(recording, settings),
         writer=lambda: writer_of(output, settings, speed),
+        warm_up=settings.warm_up if settings.network.recurrent else 0,
     )
 
 

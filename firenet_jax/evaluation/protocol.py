@@ -200,7 +200,8 @@ def steps_of(plan: Plan) -> Iterator[Window | Step]:
     recording = plan.recording
     later = (e.select(slice(np.searchsorted(e.t, plan.begin), None)) for e in recording.events())
     if plan.wanted is not None:  # a grid counts on
-        return steps(recording, plan.windows, copy.copy(plan.wanted), filter(len, later))
+        windows = cut(recording, plan.windows, filter(len, later))
+        return steps(recording, plan.windows, copy.copy(plan.wanted), windows)
     recording = dataclasses.replace(recording, frames=Frames(plan.times, plan.frames.read))
     return cut(recording, plan.windows, filter(len, later), plan.begin)
 
