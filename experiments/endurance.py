@@ -21,6 +21,7 @@ Simulated pictures are textures from `textures.HELD_OUT`, which no weights of ou
 """
 
 import argparse
+import itertools
 import json
 import tempfile
 from dataclasses import replace
@@ -38,6 +39,7 @@ import firenet_jax as fj
 from firenet_jax.commands.reconstruct import Reconstruct, run
 from firenet_jax.evaluation import metrics
 from firenet_jax.evaluation.equalise import equalise
+from firenet_jax.instants import WARM_UP
 from firenet_jax.network import Weights, initial_state
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.simulation.scenes import SceneSettings, render
@@ -323,7 +325,8 @@ def similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def frames(methods: Methods, recordings: list[Path]) -> list[dict]:
     """Windows between frames; what follows a frame by a window counts from the second on. Of a
-    camera at rest only where events are (within 3 pixels of one in the last five windows)."""
+    camera at rest only where events are (within 3 pixels of one in the last five windows). From a
+    zero state, and after the warm-up of `firenet reconstruct`."""
     rows = []
     for path in recordings:
         if path.name not in WITH_FRAMES:
@@ -331,10 +334,17 @@ def frames(methods: Methods, recordings: list[Path]) -> list[dict]:
         recording = fj.open_recording(path)
         stamps = recording.frames.times
         truths = [np.float32(recording.frames.read(k)) / 255 for k in range(len(stamps))]
-        states = {n: initial_state(1, recording.height, recording.width) for n in methods}
-        found = {name: [] for name in methods}
+        windows = partial(fj.event_tensors, recording, chunk=1, between_frames=True)
+        first = [tensors for tensors, _ in itertools.islice(windows(), WARM_UP)]
+        states = {}
+        for name, weights in methods.items():
+            state = states[name, 0] = initial_state(1, recording.height, recording.width)
+            for tensors in [*first, *(-tensors[..., ::-1] for tensors in reversed(first))]:
+                state, _ = reconstruct(weights, state, tensors)
+            states[name, WARM_UP] = state
+        found = {way: [] for way in states}
         seen = []
-        for tensors, times in fj.event_tensors(recording, chunk=1, between_frames=True):
+        for tensors, times in windows():
             seen = [*seen[-4:], np.asarray(jnp.abs(tensors[0, 0]).sum(-1) > 0)]
             near = np.asarray(
                 jax.lax.reduce_window(
@@ -343,8 +353,8 @@ def frames(methods: Methods, recordings: list[Path]) -> list[dict]:
             )
             place = int(np.argmin(np.abs(stamps - times[0])))
             close = abs(int(stamps[place]) - int(times[0])) <= 5000 and place > 0
-            for name, weights in methods.items():
-                states[name], images = reconstruct(weights, states[name], tensors)
+            for way in states:
+                states[way], images = reconstruct(methods[way[0]], states[way], tensors)
                 if not close or not near.any():
                     continue
                 image, truth = np.clip(np.asarray(images[0, 0]), 0, 1), truths[place]
@@ -354,9 +364,10 @@ def frames(methods: Methods, recordings: list[Path]) -> list[dict]:
                     label = "" if kind == "none" else "_equalised"
                     row[f"mse{label}"] = float((near * (a - b) ** 2).sum() / near.sum())
                     row[f"ssim{label}"] = float((near * similarity(a, b)).sum() / near.sum())
-                found[name].append(row)
-        for name in methods:
-            rows.append({"recording": path.name, "weights": name} | means(found[name]))
+                found[way].append(row)
+        for (name, warm_up), each in found.items():
+            labels = {"recording": path.name, "weights": name, "warm_up": warm_up}
+            rows.append(labels | means(each))
     return rows
 
 

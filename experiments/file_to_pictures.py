@@ -79,7 +79,7 @@ def by_pytorch(recording: Path, output: Path) -> None:
 
 
 def by_us(recording: Path, output: Path) -> None:
-    run(Reconstruct((recording,), output, windows=WINDOWS, display=FIXED))
+    run(Reconstruct((recording,), output, windows=WINDOWS, display=FIXED, warm_up=0))
 
 
 def stages(recording: Path, folder: Path) -> dict:

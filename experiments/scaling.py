@@ -140,7 +140,8 @@ from firenet_jax.windows import Windows
 folder, output, *where = sys.argv[1:]
 processes, process = map(int, where) if where else [None] * 2
 recordings = tuple(sorted(Path(folder).glob("*.txt")))
-choices = dict(processes=processes, process=process, windows=Windows(events_per_pixel=0.35))
+choices = dict(processes=processes, process=process, windows=Windows(events_per_pixel=0.35),
+    warm_up=0)
 run(Reconstruct(recordings, Path(output, "compiling"), **choices))
 start = time.perf_counter()
 # Elsewhere: of the same output, what this process has done is not done again.

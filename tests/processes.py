@@ -1,11 +1,15 @@
 """Scripts in processes of their own: with virtual devices, alone or together, with little room."""
 
 import json
+import multiprocessing
 import os
+import runpy
 import socket
 import subprocess
 import sys
 from importlib.metadata import version
+
+import pytest
 
 # The emitters that XLA has by default since 2025 compile a loop in twice the time of those before.
 # Only versions that are known to have the flag get it: XLA ends a process that asks for another.
@@ -13,6 +17,38 @@ OLD_EMITTERS = "--xla_cpu_use_fusion_emitters=false" if version("jax").startswit
 
 # For what does not depend on how well XLA optimises: it compiles in a fifth of the time.
 FEW_OPTIMISATIONS = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "XLA_FLAGS": OLD_EMITTERS}
+
+
+# What scripts import, which takes seconds: imported once, in a process from which each is forked.
+IMPORTED = (
+    "firenet_jax.commands.evaluate", "firenet_jax.commands.reconstruct",
+    "firenet_jax.commands.train", "matplotlib.figure", "skimage.metrics", "torch",
+)  # fmt: skip
+
+
+def run_forked(script, arguments, folder, **more):
+    """(exit code, what it has written) of a Python file that runs in `folder`, as a program."""
+    written = folder / "written.txt"
+    forks = multiprocessing.get_context("forkserver")
+    forks.set_forkserver_preload(list(IMPORTED))
+    with pytest.MonkeyPatch.context() as patch:  # jax reads its settings when it is imported
+        for name, value in more.items():
+            patch.setenv(name, value)
+        process = forks.Process(target=_program, args=(script, arguments, folder, written))
+        process.start()
+    process.join(timeout=900)
+    code = process.exitcode
+    process.kill()
+    return code, written.read_text()
+
+
+def _program(script, arguments, folder, written):
+    with open(written, "w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    os.chdir(folder)
+    sys.argv, sys.path[0] = [script, *arguments], os.path.dirname(os.path.abspath(script))
+    runpy.run_path(script, run_name="__main__")
 
 
 def start(script, *arguments, devices=1, **more):

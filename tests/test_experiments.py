@@ -3,16 +3,13 @@
 import importlib
 import importlib.util
 import json
-import os
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from processes import FEW_OPTIMISATIONS
+from processes import FEW_OPTIMISATIONS, run_forked
 from test_pipeline import write_recording
 from test_snippets import write_with_frames
 
@@ -152,11 +149,6 @@ def test_runs(name, tmp_path):
     write_with_frames(frames)
     named = {"recording": recording, "folder": recording.parent, "frames": frames}
     arguments = shlex.split(SMALL[name].format(**named))
-    done = subprocess.run(
-        [sys.executable, f"experiments/{name}.py", *arguments],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        env=os.environ | FEW_OPTIMISATIONS,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
+    script = f"experiments/{name}.py"
+    code, written = run_forked(script, arguments, tmp_path, **FEW_OPTIMISATIONS)
+    assert code == 0, written[-2000:]

@@ -7,6 +7,7 @@ lines that came after it are dropped.
 import contextlib
 import json
 import math
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -17,7 +18,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from PIL import Image
-from tensorboardX import SummaryWriter
 
 from firenet_jax.checkpoint import save_weights
 from firenet_jax.devices import is_first
@@ -25,6 +25,16 @@ from firenet_jax.errors import logger
 from firenet_jax.network import Weights
 from firenet_jax.pictures import event_pictures
 from firenet_jax.storage.files import write_text, writing
+
+# tensorboardX imports PyTorch where it is installed, for tensors that it is not given here: that
+# takes as long as all else that training imports.
+_torch = sys.modules.get("torch")
+sys.modules["torch"] = _torch  # pyright: ignore[reportArgumentType]
+try:
+    from tensorboardX import SummaryWriter
+finally:
+    if _torch is None:
+        del sys.modules["torch"]
 
 
 class Log:
