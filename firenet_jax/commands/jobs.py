@@ -183,6 +183,7 @@ def do_jobs(
     chunks = ahead(in_chunks(jobs, way, slots, devices, outcome, opened), depth=1)
     finished = ahead(computed(chunks, jobs[0].recording, way, weights, slots, devices), depth=1)
     screen, pictures = Screen() if show else None, 0
+    warming = any(job.warm_up for job in jobs)
     try:
         for chunk, shown in finished:
             for slot, part in chunk.parts.items():
@@ -191,7 +192,8 @@ def do_jobs(
                 if part.ends:
                     finish(part.running, way, outcome)
                     del opened[part.running.job.output]
-            progress.set_postfix_str(counted(pictures, "picture"), refresh=False)
+            said = "warming up" if warming and not pictures else counted(pictures, "picture")
+            progress.set_postfix_str(said, refresh=False)
             progress.update(read.read() - progress.n if read.total else chunk.count)
     finally:
         finished.close()
