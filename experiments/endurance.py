@@ -40,7 +40,7 @@ from firenet_jax.commands.reconstruct import Reconstruct, run
 from firenet_jax.evaluation import metrics
 from firenet_jax.evaluation.equalise import equalise
 from firenet_jax.instants import WARM_UP
-from firenet_jax.network import Weights, initial_state
+from firenet_jax.network import State, Weights, initial_state
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.simulation.scenes import SceneSettings, render
 from firenet_jax.simulation.sensor import (
@@ -310,6 +310,13 @@ def contrast(files: dict[str, Path | None], recordings: list[Path]) -> list[dict
     return rows
 
 
+def warmed(weights: Weights, state: State, first: list[jax.Array]) -> State:
+    """The state after the warm-up of `firenet reconstruct`, from tensors (1, B, H, W, 5)."""
+    for tensors in [*first, *(-tensors[..., ::-1] for tensors in reversed(first))]:
+        state, _ = reconstruct(weights, state, tensors)
+    return state
+
+
 def similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """SSIM of each pixel."""
     return structural_similarity(
@@ -338,10 +345,8 @@ def frames(methods: Methods, recordings: list[Path]) -> list[dict]:
         first = [tensors for tensors, _ in itertools.islice(windows(), WARM_UP)]
         states = {}
         for name, weights in methods.items():
-            state = states[name, 0] = initial_state(1, recording.height, recording.width)
-            for tensors in [*first, *(-tensors[..., ::-1] for tensors in reversed(first))]:
-                state, _ = reconstruct(weights, state, tensors)
-            states[name, WARM_UP] = state
+            zero = initial_state(1, recording.height, recording.width)
+            states |= {(name, 0): zero, (name, WARM_UP): warmed(weights, zero, first)}
         found = {way: [] for way in states}
         seen = []
         for tensors, times in windows():

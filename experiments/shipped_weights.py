@@ -17,6 +17,7 @@ docs/shipped_recordings.jpg.
 """
 
 import argparse
+import itertools
 import json
 from dataclasses import replace
 from functools import partial
@@ -25,6 +26,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from endurance import warmed
 from harness import RESULTS, save
 from PIL import Image
 
@@ -32,6 +34,7 @@ import firenet_jax as fj
 from firenet_jax.commands.info import describe
 from firenet_jax.evaluation import metrics
 from firenet_jax.evaluation.equalise import equalise
+from firenet_jax.instants import WARM_UP
 from firenet_jax.network import initial_state
 from firenet_jax.pictures import display, event_pictures, initial_display_state
 from firenet_jax.reconstruction import reconstruct
@@ -121,16 +124,19 @@ def recording_sheet(path: Path, methods: dict) -> tuple[Image.Image, dict]:
     about = describe(path)
     recording = fj.open_recording(path)
     count = min(about["events"] // SHOWN, round(0.35 * recording.height * recording.width))
+    windows = partial(fj.event_tensors, recording, chunk=1, events=count)
+    first = [tensors for tensors, _ in itertools.islice(windows(), WARM_UP)]
+    zero = initial_state(1, recording.height, recording.width)
     states = {
-        name: (initial_state(1, recording.height, recording.width), initial_display_state(1))
-        for name in methods
+        name: (warmed(weights, zero, first), initial_display_state(1))
+        for name, weights in methods.items()
     }
     total = about["events"] // count
     wanted = {total // 2, total * 3 // 4, total - 1}
     rows = {name: [] for name in ("events", *methods)}
     found = {name: [] for name in methods}
     before, seen = {}, 0
-    for tensors, _ in fj.event_tensors(recording, chunk=1, events=count):
+    for tensors, _ in windows():
         for name, weights in methods.items():
             state, shown = states[name]
             state, images = reconstruct(weights, state, tensors)
