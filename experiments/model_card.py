@@ -71,12 +71,22 @@ def rest(shipped: dict, endurance: dict) -> list[list[str]]:
     ]
 
 
+def frames(shipped: dict, endurance: dict) -> list[list[str]]:
+    found = {(r["recording"], r["warm_up"], r["weights"]): r for r in endurance["frames"]}
+    keys = {"mse": 3, "ssim": 3, "mse_equalised": 3, "ssim_equalised": 3}
+    return [
+        [*map(str, key[:2]), NAMES[key[2]]] + [f"{found[key][k]:.{n}f}" for k, n in keys.items()]
+        for key in sorted(found, key=lambda key: (*key[:2], list(NAMES).index(key[2])))
+    ]
+
+
 TABLES = {
     ("sensor", "speed"): accuracy,
     ("recording", "ours against the published weights"): recordings,
     ("sensor", "windows"): long,
     ("sensor", "weights"): density,
     ("noise", "weights"): rest,
+    ("recording", "warm-up"): frames,
 }
 
 
