@@ -56,7 +56,7 @@ def test_pictures_of_a_real_recording(tmp_path, reference, recordings, kind):
     run(
         Reconstruct(
             (path,), tmp_path / "out", checkpoint, Windows(events=count),
-            network=Network(pad=16), display=Display(range=kind),
+            network=Network(pad=16), display=Display(range=kind), warm_up=0,
         )
     )  # fmt: skip
     rows = np.loadtxt(path / "events.txt")
