@@ -505,10 +505,9 @@ def test_nothing_recompiles_while_200_windows_of_200_sizes_stream(tmp_path, weig
     rng = np.random.default_rng(0)
     steps = [np.sort(np.append(rng.integers(0, 5000, size - 1), 0)) for size in sizes]
     t = np.concatenate([5000 * k + step for k, step in enumerate(steps)])
-    rows = zip(t, rng.integers(0, WIDTH, t.size), rng.integers(0, HEIGHT, t.size), strict=True)
-    recording = tmp_path / "sizes.txt"
-    lines = "".join(f"{t / 1e6:.6f} {x} {y} 1\n" for t, x, y in rows)
-    recording.write_text(f"{WIDTH} {HEIGHT}\n{lines}")
+    x, y = rng.integers(0, WIDTH, t.size), rng.integers(0, HEIGHT, t.size)
+    recording = tmp_path / "sizes.npy"
+    np.save(recording, np.stack([t, x, y, np.ones_like(t)], 1))
     command = [sys.executable, "-c", COUNT_COMPILATIONS, recording, weights, tmp_path / "out"]
     done = subprocess.run([str(word) for word in command], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
