@@ -21,6 +21,7 @@ at the beginning, with a state that knows the scene.
 
 import itertools
 import math
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -100,7 +101,7 @@ def warming(
     the windows is raised where it was.
     """
     cutter = iter(cutter)
-    seen: list[Window] = []
+    seen: deque[Window] = deque()
     damage = None
     try:
         for window in itertools.islice(cutter, count):
@@ -111,7 +112,8 @@ def warming(
         damage = error
 
     def again() -> Iterator[Window]:
-        yield from seen
+        while seen:  # nothing keeps them longer
+            yield seen.popleft()
         if damage is not None:
             raise damage
         yield from cutter

@@ -319,7 +319,7 @@ def images_at(
     before the first event or after the last one get no image.
     windows: those that update the state, as `windows.Windows` takes them; default: 0.35 events per
     pixel, at most 40 ms, as in `firenet reconstruct`. An image depends on these and on the events
-    up to its time, not on which other times are requested.
+    up to its time and those of the warm-up, not on which other times are requested.
     chunk: steps per call of the device. Memory holds one chunk, whatever the recording's length.
     warm_up: windows of the beginning that the network sees beforehand, see `instants.warming`.
     Raises ValueError for invalid windows, RecordingError if the file is damaged.
