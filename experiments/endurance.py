@@ -12,6 +12,8 @@ given, ours=PATH. The questions, each a function, an entry of results/endurance.
     palindrome  a recording forward and backward, 40 times: all that was seen comes back, so the
                 image should be the same each time.
     density     the same scenes cut into windows of .03 to 3 events per pixel.
+    light       cameras that move or stand still, in steady light and before a lamp that flickers, at
+                .35 events per pixel and at most 40 ms a window, as in `firenet reconstruct`.
     contrast    what `firenet reconstruct RECORDING` shows: grey levels' standard deviation, and
                 how much the mean brightness moves from one picture to the next.
     frames      recordings with camera frames: SSIM and MSE, with and without local equalisation.
@@ -23,6 +25,7 @@ Simulated pictures are textures from `textures.HELD_OUT`, which no weights of ou
 import argparse
 import itertools
 import json
+import math
 import tempfile
 from dataclasses import replace
 from functools import partial
@@ -66,6 +69,8 @@ MOST = 40  # windows of a palindrome
 DENSITIES = (0.03, 0.1, 0.35, 1.0, 3.0)
 SPEEDS = {"slow": (5.0, 50.0), "fast": (200.0, 1000.0)}
 WARM, JUDGED = 30, 10  # windows of a sequence of one density
+FLICKER = (0.1, 0.9)
+USUAL, LONGEST = 0.35, 40_000.0  # events per pixel, microseconds: windows of `firenet reconstruct`
 PIXELS = 40.0  # by which a window of a density moves, at most: one for each rendering
 WITH_FRAMES = ("davis346_59_frames.aedat4", "ecd_slider_depth", "davis346_frames.aedat4")
 
@@ -211,34 +216,62 @@ def _rates(sensors, scenes, durations, windows, *, height, width, renderings=64)
     return count / (height * width) / (renderings / 8)
 
 
-def density(methods: Methods, sequences: int) -> list[dict]:
-    pictures, rows = textures(), []
+def _scored(
+    methods: Methods,
+    sequences: int,
+    scene: SceneSettings,
+    sensor: SensorSettings,
+    wanted: float,
+    longest: float = math.inf,
+) -> dict[str, list[dict]]:
+    """Scores of the last windows of sequences in which `wanted` events per pixel make a window.
+
+    longest: microseconds of a window at most.
+    """
+    pictures = textures()
     windows = WARM + JUDGED
-    for sensor in SENSORS:
-        for speed in SPEEDS:
-            scene = SceneSettings(speed=SPEEDS[speed], pause=0.0)
-            for wanted in DENSITIES:
-                found = {name: [] for name in methods}
-                for n in range(sequences // BATCH):
-                    make = partial(
-                        random_setups, jax.random.key(n), pictures, batch=BATCH, scene=scene,
-                        sensor=SENSORS[sensor], **SIZE,
-                    )  # fmt: skip
-                    sensors, scenes, durations = make(windows=400)
-                    rate = _rates(sensors, scenes, durations, 400, **SIZE)
-                    longest = 1e6 * PIXELS / scenes.speed
-                    durations = jnp.clip(durations * wanted / jnp.maximum(rate, 1e-6), 200, longest)
-                    durations = durations.astype(jnp.int32)
-                    bounds = window_bounds(durations, windows)
-                    data = simulate(sensors, scenes, bounds, renderings=round(PIXELS), **SIZE)[1]
-                    truths = np.asarray(data.images[WARM:])
-                    for name, weights in methods.items():
-                        state = initial_state(BATCH, *SIZE.values())
-                        images = np.asarray(reconstruct(weights, state, data.tensors)[1])
-                        found[name] += scores(images[WARM:], truths, equalised=True)
-                for name in methods:
-                    labels = {"sensor": sensor, "speed": speed, "density": wanted, "weights": name}
-                    rows.append(labels | means(found[name]))
+    found = {name: [] for name in methods}
+    for n in range(sequences // BATCH):
+        make = partial(
+            random_setups, jax.random.key(n), pictures, batch=BATCH, scene=scene, sensor=sensor,
+            **SIZE,
+        )  # fmt: skip
+        sensors, scenes, durations = make(windows=400)
+        rate = _rates(sensors, scenes, durations, 400, **SIZE)
+        most = jnp.minimum(1e6 * PIXELS / scenes.speed, longest)
+        durations = jnp.clip(durations * wanted / jnp.maximum(rate, 1e-6), 200, most)
+        bounds = window_bounds(durations.astype(jnp.int32), windows)
+        data = simulate(sensors, scenes, bounds, renderings=round(PIXELS), **SIZE)[1]
+        truths = np.asarray(data.images[WARM:])
+        for name, weights in methods.items():
+            state = initial_state(BATCH, *SIZE.values())
+            images = np.asarray(reconstruct(weights, state, data.tensors)[1])
+            found[name] += scores(images[WARM:], truths, equalised=True)
+    return found
+
+
+def density(methods: Methods, sequences: int) -> list[dict]:
+    rows = []
+    for sensor, speed in itertools.product(SENSORS, SPEEDS):
+        scene = SceneSettings(speed=SPEEDS[speed], pause=0.0)
+        for wanted in DENSITIES:
+            found = _scored(methods, sequences, scene, SENSORS[sensor], wanted)
+            for name in methods:
+                labels = {"sensor": sensor, "speed": speed, "density": wanted, "weights": name}
+                rows.append(labels | means(found[name]))
+    return rows
+
+
+def light(methods: Methods, sequences: int) -> list[dict]:
+    rows = []
+    lights = {"steady": None, "flickering": FLICKER}
+    for camera, kind in itertools.product(("moving", "still"), lights):
+        scene = SceneSettings(speed=(20.0, 500.0), pause=0.0, still=float(camera == "still"))
+        sensor = replace(SENSORS["faulty"], flicker=lights[kind])
+        found = _scored(methods, sequences, scene, sensor, USUAL, LONGEST)
+        for name in methods:
+            labels = {"camera": camera, "light": kind, "weights": name}
+            rows.append(labels | means(found[name]))
     return rows
 
 
@@ -378,7 +411,7 @@ def frames(methods: Methods, recordings: list[Path]) -> list[dict]:
 
 # ---- All of it
 
-SIMULATED = {"long": long, "rest": rest, "density": density}
+SIMULATED = {"long": long, "rest": rest, "density": density, "light": light}
 RECORDED = {"palindrome": palindrome, "frames": frames, "contrast": contrast}
 
 

@@ -17,7 +17,7 @@ from firenet_jax.events import Events, concatenate
 from firenet_jax.readers import open_recording
 from firenet_jax.simulation.clip import read_clip
 from firenet_jax.simulation.scenes import SceneSettings
-from firenet_jax.simulation.sensor import EPS
+from firenet_jax.simulation.sensor import EPS, SensorSettings, random_sensor
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage import sequence_file
 from firenet_jax.storage.files import locked
@@ -454,6 +454,7 @@ def test_everything_wrong_is_one_sentence(tmp_path, monkeypatch, capsys):
         ("-o new --sensor-size 40000x16", "at most 32768"),
         ("-o new --seed -1", "seed is -1"),
         ("-o new.h5 --video clip.mp4 --fps 5 --objects 7", "fps, scene: no part in turning"),
+        ("-o new.h5 --video clip.mp4 --flicker .1 .9", "too far apart to show it"),
     ],
 )
 def test_settings_that_cannot_be_are_said(capsys, line, expected):
@@ -471,6 +472,20 @@ def test_a_folder_without_pictures_is_one_sentence(tmp_path, monkeypatch, capsys
             assert name in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.h5"))
     run(settings(tmp_path / "set", sequences=1, validation=0))  # nothing stands in the way
+
+
+def test_a_lamp_flickers_at_its_own_rate(tmp_path):
+    """Not at a beat with renderings that are too far apart: the strongest rate in the events."""
+    sensor = SensorSettings(flicker=(0.8, 0.8))
+    chosen = settings(tmp_path, seconds=0.5, scene=SceneSettings(speed=(1.0, 1.0), pause=0.0))
+    textures, key = dataset._textures(None, 0, 0, 0), jax.random.key(0)
+    events, _ = dataset.sequence(key, textures, chosen, sensor, HEIGHT, WIDTH)
+    events = concatenate(list(events))
+    lamp = random_sensor(jax.random.split(key)[1], height=2, width=2, settings=sensor).lamp
+    signs = np.where(events.p, 1.0, -1.0)
+    added = np.histogram(events.t, 500, (0, 500_000), weights=signs)[0]
+    rates, strength = np.fft.rfftfreq(500, 1e-3), np.abs(np.fft.rfft(added))
+    assert abs(rates[strength.argmax()] - float(lamp.hertz)) < 2.1
 
 
 def test_number_of_pictures_follows_the_duration(tmp_path):

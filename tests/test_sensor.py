@@ -43,6 +43,7 @@ def plain_sensor(on=0.2, off=0.17, refractory=0.0):
         cutoff=None,
         phase=None,
         start=None,
+        lamp=None,
         key=jax.random.key(0),
     )
 
@@ -289,6 +290,8 @@ def test_faults_are_switched_on_but_what_is_given_stays():
         ({"noise": (0.0, 10.0)}, "noise is 0 10, but is drawn log-uniformly"),
         ({"leak": (0.5, 0.1)}, "the least first"), ({"hot": (0.5, 5.0)}, "part of the pixels"),
         ({"cutoff": (1.0, np.nan)}, "cutoff"), ({"threshold_range": (0.0, 1.0)}, "threshold_range"),
+        ({"flicker": (0.5, 1.5)}, "light is not negative"),
+        ({"flicker": (0.0, 0.5)}, "flicker is 0 0.5"),
         ({"threshold": -1.0}, "threshold is -1"), ({"refractory": -1.0}, "refractory is -1"),
         ({"mismatch": np.nan}, "mismatch"),
         ({"threshold": 0.3, "threshold_range": (0.1, 0.6)}, "pass --threshold-range None too"),
@@ -377,6 +380,42 @@ def test_bandwidth_lets_slow_changes_pass_and_holds_fast_ones_back():
     assert at_pixel(listed(dark, times, logs), 0, 0)[0][0] > 1.5 * t[0]
 
 
+def test_a_lamp_fires_where_its_light_crosses_thresholds_and_falls_off_around_a_place():
+    """Grey under a sinusoid of light is the loop over crossings; the swing is a Gaussian."""
+    lamp = jax.device_get(with_only(9, flicker=(0.6, 0.6)).lamp)
+    assert 60 <= lamp.hertz <= 240 and 0.5 < lamp.swing.max() <= 0.6
+    swing = np.log(np.float64(lamp.swing))  # a paraboloid: curved alike everywhere, both ways
+    curved = np.diff(swing, 2, axis=1), np.diff(swing, 2, axis=0)
+    for each in curved:
+        np.testing.assert_allclose(each, curved[0][0, 0], rtol=0.02)
+    assert 0.15 <= np.sqrt(-2 / curved[0][0, 0]) / max(H, W) <= 2
+
+    times = np.arange(0, 50_001, 100)
+    events = listed(plain_sensor()._replace(lamp=lamp), times, np.full((len(times), H, W), -1.0))
+    grey, turns = np.exp(-1.0) - EPS, 2 * np.pi * (lamp.start + lamp.hertz * 1e-6 * times)
+    on, off = float(np.float32(0.2)), float(np.float32(0.17))
+    for y, x in ((0, 0), (H // 2, W // 2), (H - 1, W - 1)):
+        logs = np.log(EPS + grey * (1 + lamp.swing[y, x] * np.sin(turns)))
+        expected = esim_pixel(times, logs, on, off)
+        t, p = at_pixel(events, y, x)
+        assert p.tolist() == [p for _, p in expected] and len(p) > 10
+        np.testing.assert_allclose(t, [t for t, _ in expected], atol=1.5)
+
+
+def test_the_lamp_goes_on_from_step_to_step():
+    sensor = with_only(9, flicker=(0.6, 0.6))
+    grey = jnp.full((H, W), 0.4)
+    states = [module.first_state(sensor, grey)]
+    for duration in (500, 1500, 700):
+        states.append(module.step(sensor, states[-1], grey, jnp.int32(duration))[0])
+    cycles = sensor.lamp.start + sensor.lamp.hertz * np.cumsum([0, 500, 1500, 700]) * 1e-6
+    np.testing.assert_allclose([state.cycles for state in states], cycles % 1, atol=1e-5)
+    swing = sensor.lamp.swing[None] * np.sin(2 * np.pi * cycles)[:, None, None]
+    logs = np.stack([state.log for state in states])  # the bandwidth is far above the lamp's
+    np.testing.assert_allclose(logs, np.log(EPS + 0.4 * (1 + swing)), atol=1e-4)
+    assert with_only(9).lamp is None
+
+
 def test_the_same_key_gives_the_same_events():
     times = np.arange(0, 200_000, 5000)
     logs = random_logs(6, times)
@@ -396,7 +435,8 @@ SQUARE = {"height": SIZE, "width": SIZE}
 
 
 SETTINGS = dict(batch=B, windows=T, renderings=RENDERINGS, motion=(2.0, 2.5), **SQUARE) | dict(
-    scene=SceneSettings(objects=1, pause=0.0, speed=(60.0, 400.0)), sensor=FAULTY
+    scene=SceneSettings(objects=1, pause=0.0, speed=(60.0, 400.0)),
+    sensor=replace(FAULTY, flicker=(0.2, 0.4)),
 )
 
 
@@ -407,7 +447,7 @@ def textures():
 
 @pytest.fixture(scope="module")
 def setups(textures):
-    """Sensors with every fault, a slow and a fast scene with an object each, bounds."""
+    """Sensors with every fault and a lamp, a slow and a fast scene with an object each, bounds."""
     *both, durations = module.random_setups(jax.random.key(8), textures, **SETTINGS)
     return *both, module.window_bounds(durations, SETTINGS["windows"])
 
@@ -630,7 +670,7 @@ def test_noise_of_drawn_signs_adds_up_and_alternating_noise_does_not():
 
 
 def test_a_clean_sensor_among_faulty_ones_is_the_papers(textures):
-    settings = replace(FAULTY, threshold_range=(0.3, 0.6), clean=0.5)
+    settings = replace(FAULTY, threshold_range=(0.3, 0.6), clean=0.5, flicker=(0.5, 0.9))
     make = partial(module.random_sensor, height=8, width=9)
     keys = jax.random.split(jax.random.key(0), 200)
     sensors = jax.jit(jax.vmap(partial(make, settings=settings)))(keys)
@@ -640,6 +680,8 @@ def test_a_clean_sensor_among_faulty_ones_is_the_papers(textures):
     for name in ("on", "off", "refractory", "drift", "noise", "cutoff"):
         mixed, usual = (np.asarray(getattr(s, name)) for s in (sensors, faulty))
         np.testing.assert_array_equal(mixed[~clean], usual[~clean])
+    swing = np.asarray(sensors.lamp.swing)
+    assert not swing[clean].any() and (swing[~clean].max((1, 2)) > 0.4).all()
     for thresholds in (np.asarray(sensors.on)[clean], np.asarray(sensors.off)[clean]):
         assert np.ptp(thresholds, (1, 2)).max() == 0 and not np.asarray(sensors.drift)[clean].any()
         assert abs(thresholds.mean() - 0.18) < 0.01 and abs(thresholds[:, 0, 0].std() - 0.03) < 0.01

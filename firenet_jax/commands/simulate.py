@@ -34,6 +34,7 @@ from firenet_jax.simulation.scenes import (
     video,
 )
 from firenet_jax.simulation.sensor import (
+    FLICKER_INTERVAL,
     SensorSettings,
     event_list,
     random_sensor,
@@ -135,6 +136,10 @@ class Simulate:
             if idle:
                 raise SettingsError(
                     f"{', '.join(idle)}: no part in turning a video into events: leave it out"
+                )
+            if self.sensor.flicker is not None:
+                raise SettingsError(
+                    "flicker: pictures of a video are too far apart to show it: leave it out"
                 )
 
 
@@ -266,7 +271,8 @@ def sequence(
     times = np.round(np.arange(count) * 1e6 / settings.fps).astype(np.int64)
     times = times[times <= round(1e6 * settings.seconds)]
     bounds = np.append(times, round(1e6 * settings.seconds))
-    renderings = video(scene, rendering_times(scene, bounds, **size), **size)
+    longest = {} if camera.lamp is None else {"longest": FLICKER_INTERVAL}
+    renderings = video(scene, rendering_times(scene, bounds, **longest, **size), **size)
     events = ahead(event_list(camera, renderings), depth=64)
     return events, ahead(_pictures(scene, times, settings.fps, height, width), depth=4)
 

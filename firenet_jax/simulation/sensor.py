@@ -15,6 +15,8 @@ may last two seconds. (An event in the last half microsecond of a window is stam
 window's end. The tensor on the device includes it; cutting the list into [start, end) puts it into
 the next window.)
 
+Light that flickers is the sensor's too: the truth does not show it.
+
 Images are (H, W) float32 in [0, 1]. Sensors, states and runs are those of one sequence; `jax.vmap`
 makes batches.
 """
@@ -42,6 +44,10 @@ NOISE_IN_LIGHT = 0.25  # times the noise in the dark
 TICKS = 1024  # per microsecond
 EVENTS_PER_PASS = 4  # of a pixel, in one pass over the picture: saves memory traffic
 MAX_INTERVAL = 2**31 // TICKS - 1  # microseconds between two renderings
+# Lamps on mains of 50 and 60 hertz flicker at 100 and 120, screens from 60 on.
+FLICKER_HERTZ = (60.0, 240.0)
+REACH = (0.15, 2.0)  # of a lamp, in sides of the picture
+FLICKER_INTERVAL = 500  # microseconds between renderings that show it: an eighth of its period
 SLOW, SWIFT = (0.02, 0.3), (16.0, 90.0)  # pixels per window, in slow and swift sequences
 # Slow sequences have this many times the mismatch, so that the pixels of an edge fire one by one.
 SLOW_MISMATCH = 4.0
@@ -100,6 +106,9 @@ class SensorSettings:
     """Bandwidth of the pixels in hertz: a first-order low-pass filter on log intensity."""
     cutoff_dark: float = 0.1
     """Bandwidth in the dark, relative to full light; 1: independent of light."""
+    flicker: tuple[float, float] | None = None
+    """Light of a lamp or screen that flickers at 60 to 240 Hz: how far it rises and falls, relative
+    to its mean, as a sinusoid. It is strongest at a random place. Not among all faults."""
     clean: float = 0.0
     """Share of the sequences with the paper's thresholds and none of these faults."""
     mid_recording: bool = False
@@ -114,6 +123,12 @@ class SensorSettings:
         for name in ("noise", "leak", "hot", "cutoff"):
             if _on(getattr(self, name)):
                 check_range(name, getattr(self, name))
+        if _on(self.flicker):
+            check_range("flicker", self.flicker)
+            if self.flicker[1] > 1:
+                raise SettingsError(
+                    f"flicker is {self.flicker}, but light is not negative: at most 1"
+                )
         if not 0 <= self.clean <= 1:
             raise SettingsError(f"clean is {self.clean}, but is a part of the sequences, 0-1")
         if _on(self.hot) and self.hot[1] > 1:
@@ -161,6 +176,14 @@ def with_faults(sensor: SensorSettings) -> SensorSettings:
     return dataclasses.replace(FAULTY, **chosen)
 
 
+class Lamp(NamedTuple):
+    """Light that flickers: intensity is multiplied by 1 + swing sin(2 pi cycles)."""
+
+    swing: jax.Array  # (H, W)
+    hertz: jax.Array  # ()
+    start: jax.Array  # () cycles at the first rendering
+
+
 class Sensor(NamedTuple):
     """The sensor of one sequence. A fault that is off is None and costs nothing."""
 
@@ -174,6 +197,7 @@ class Sensor(NamedTuple):
     phase: jax.Array | None  # (H, W) share of the first threshold already crossed where L drifts,
     # and whether noise starts with ON; otherwise all pixels would start with the same event
     start: jax.Array | None  # (H, W) L above the reference at the first rendering
+    lamp: Lamp | None
     key: jax.Array  # of the noise
 
 
@@ -184,6 +208,7 @@ class SensorState(NamedTuple):
     above: jax.Array  # (H, W) float32, L above the reference: small, so no rounding adds up
     silent: jax.Array | None  # (H, W) int32, ticks until the refractory period is over
     noise_on: jax.Array | None  # (H, W) bool, whether the next noise event is ON
+    cycles: jax.Array | None  # () float32 in [0, 1), where the lamp is in its period
     renderings: jax.Array  # () int32, how many so far; selects the random numbers of the noise
 
 
@@ -248,12 +273,32 @@ def random_sensor(
     if _on(settings.cutoff):
         cutoff = jnp.stack([log_uniform(settings.cutoff), settings.cutoff_dark])
     refractory = jnp.round(refractory * 1e6 * TICKS).astype(jnp.int32) if silenced else None
-    sensor = Sensor(on, off, refractory, drift, noise, cutoff, phase, start, noise_key)
+    lamp = _lamp(jax.random.fold_in(key, 3), shape, settings.flicker)
+    sensor = Sensor(on, off, refractory, drift, noise, cutoff, phase, start, lamp, noise_key)
     if not settings.clean:
         return sensor
     clean_key, plain_key = jax.random.split(jax.random.fold_in(key, 2))
     clean = jax.random.uniform(clean_key) < settings.clean
     return _without_faults(sensor, clean, jax.random.normal(plain_key, (2,)))
+
+
+def _lamp(
+    key: jax.Array, shape: tuple[int, int], flicker: tuple[float, float] | None
+) -> Lamp | None:
+    """Brightest at a random place, whence its swing falls off as a Gaussian."""
+    if not _on(flicker):
+        return None
+    numbers = jax.random.uniform(key, (6,))
+
+    def log_uniform(bounds, number):
+        low, high = (math.log(bound) for bound in bounds)
+        return jnp.exp(low + (high - low) * number)
+
+    y, x = (jnp.arange(length) / max(shape) for length in shape)
+    down, across = (y - numbers[0] * y[-1]) ** 2, (x - numbers[1] * x[-1]) ** 2
+    away = (down[:, None] + across[None]) / log_uniform(REACH, numbers[3]) ** 2
+    swing = log_uniform(flicker, numbers[2]) * jnp.exp(-away)
+    return Lamp(swing, log_uniform(FLICKER_HERTZ, numbers[4]), numbers[5])
 
 
 def _without_faults(sensor: Sensor, clean: jax.Array, spread: jax.Array) -> Sensor:
@@ -271,6 +316,7 @@ def _without_faults(sensor: Sensor, clean: jax.Array, spread: jax.Array) -> Sens
         drift=unless(0.0, sensor.drift),
         noise=unless(jnp.array([0.0, NOISE_IN_LIGHT, 0.0]), sensor.noise),
         cutoff=unless(jnp.array([1e9, 1.0]), sensor.cutoff),  # so high that it has no effect
+        lamp=sensor.lamp and sensor.lamp._replace(swing=unless(0.0, sensor.lamp.swing)),
     )
 
 
@@ -280,7 +326,8 @@ def log_intensity(image: jax.Array) -> jax.Array:
 
 def first_state(sensor: Sensor, image: jax.Array) -> SensorState:
     """The first rendering (H, W) sets every pixel's reference."""
-    log = log_intensity(image)
+    cycles = None if sensor.lamp is None else sensor.lamp.start
+    log = log_intensity(_lit(sensor.lamp, cycles, image))
     above = jnp.zeros_like(log)
     if sensor.drift is not None and sensor.phase is not None:
         drifted = jnp.where(sensor.drift > 0, sensor.on, -sensor.off) * sensor.phase
@@ -292,7 +339,14 @@ def first_state(sensor: Sensor, image: jax.Array) -> SensorState:
     noise_on = None
     if sensor.noise is not None and sensor.phase is not None:
         noise_on = sensor.phase * 1024 % 2 < 1
-    return SensorState(log, above, silent, noise_on, jnp.int32(0))
+    return SensorState(log, above, silent, noise_on, cycles, jnp.int32(0))
+
+
+def _lit(lamp: Lamp | None, cycles: jax.Array | None, image: jax.Array) -> jax.Array:
+    """What a rendering (H, W) looks like in the light of this moment."""
+    if lamp is None or cycles is None:
+        return image
+    return image * (1 + lamp.swing * jnp.sin(2 * jnp.pi * cycles))
 
 
 def step(
@@ -304,10 +358,14 @@ def step(
     """
     seconds = 1e-6 * duration.astype(jnp.float32)
     ticks = TICKS * duration  # int32
-    before, after = state.log, log_intensity(image)
+    cycles = state.cycles
+    if sensor.lamp is not None and cycles is not None:
+        cycles = (cycles + seconds * sensor.lamp.hertz) % 1
+    lit = _lit(sensor.lamp, cycles, image)
+    before, after = state.log, log_intensity(lit)
     if sensor.cutoff is not None:
         cutoff, dark = sensor.cutoff
-        rate = 2 * jnp.pi * cutoff * (dark + (1 - dark) * image)
+        rate = 2 * jnp.pi * cutoff * (dark + (1 - dark) * lit)
         after = before - jnp.expm1(-seconds * rate) * (after - before)
 
     rise = after - before
@@ -345,7 +403,7 @@ def step(
         noise = _shot_noise(bits, expected, jnp.where(noise_on, 1.0, -1.0), ticks)
         noise_on = noise_on ^ (noise.count > 0)
         runs += (noise,)
-    return SensorState(after, above, silent, noise_on, state.renderings + 1), runs
+    return SensorState(after, above, silent, noise_on, cycles, state.renderings + 1), runs
 
 
 def _refractory(run: Run, silent: jax.Array, refractory: jax.Array, ticks: jax.Array):
