@@ -12,8 +12,9 @@ given, ours=PATH. The questions, each a function, an entry of results/endurance.
     palindrome  a recording forward and backward, 40 times: all that was seen comes back, so the
                 image should be the same each time.
     density     the same scenes cut into windows of .03 to 3 events per pixel.
-    light       cameras that move or stand still, in steady light and before a lamp that flickers, at
-                .35 events per pixel and at most 40 ms a window, as in `firenet reconstruct`.
+    light       cameras that move or stand still, in steady light and in that of a lamp that
+                flickers, at .35 events per pixel and at most 40 ms a window, as in `firenet
+                reconstruct`.
     contrast    what `firenet reconstruct RECORDING` shows: grey levels' standard deviation, and
                 how much the mean brightness moves from one picture to the next.
     frames      recordings with camera frames: SSIM and MSE, with and without local equalisation.
@@ -28,7 +29,7 @@ import json
 import math
 import tempfile
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import jax
@@ -77,6 +78,7 @@ WITH_FRAMES = ("davis346_59_frames.aedat4", "ecd_slider_depth", "davis346_frames
 Methods = dict[str, Weights]
 
 
+@cache
 def textures() -> jax.Array:
     return jnp.asarray(load_textures(photographs(HELD_OUT), 40, 320, seed=0))
 
