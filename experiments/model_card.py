@@ -60,6 +60,16 @@ def density(shipped: dict, endurance: dict) -> list[list[str]]:
     ]
 
 
+def light(shipped: dict, endurance: dict) -> list[list[str]]:
+    found = {(row["camera"], row["light"], row["weights"]): row for row in endurance["light"]}
+    keys = {"ssim": 3, "mse": 4, "ssim_equalised": 3, "mse_equalised": 4}
+    return [
+        [*kind, NAMES[name]] + [f"{found[*kind, name][k]:.{n}f}" for k, n in keys.items()]
+        for kind in dict.fromkeys(key[:2] for key in found)
+        for name in NAMES
+    ]
+
+
 def rest(shipped: dict, endurance: dict) -> list[list[str]]:
     found = {(row["noise"], row["weights"]): row for row in endurance["rest"]}
     return [
@@ -85,6 +95,7 @@ TABLES = {
     ("recording", "ours against the published weights"): recordings,
     ("sensor", "windows"): long,
     ("sensor", "weights"): density,
+    ("camera", "light"): light,
     ("noise", "weights"): rest,
     ("recording", "warm-up"): frames,
 }

@@ -332,6 +332,37 @@ def test_before_a_still_camera_only_objects_move():
     assert 0 < stood < MANY
 
 
+def test_a_shaking_camera_comes_back_again_and_again():
+    """By less than it is allowed to, and no faster than said; one without a shake goes away."""
+    settings = SceneSettings(objects=2, speed=SPEEDS, pause=0.0, still=1.0)
+    shaking = replace(settings, shake=1.0, shake_pixels=(2.0, 2.0))
+    make = partial(random_scene, textures=smooth_textures(), duration=DURATION, **SIZE)
+    times = np.linspace(0.0, DURATION, 400, dtype=np.float32)
+
+    @jax.jit
+    def middle(scene):  # of the background, in the picture
+        def at(t):
+            matrix = module._to_image(scene, t, H, W)[0]
+            return jnp.stack(module._project(matrix, *jnp.zeros((2, 1))))[:, 0]
+
+        return jax.vmap(at)(times)
+
+    stood = 0
+    for key in jax.random.split(jax.random.key(1), 6):
+        scene = make(key, settings=shaking)
+        rest = np.asarray(middle(scene._replace(shake=None)))
+        away = np.asarray(middle(scene)) - rest
+        assert 0.3 < np.abs(away).max() < 2 * 1.3  # nearer than at rest it looks larger
+        turns = (np.diff(np.sign(np.diff(away[:, 0]))) != 0).sum()
+        assert turns >= 4 * DURATION
+        assert float(speeds(scene, times, **SIZE).max()) <= float(scene.speed) <= SPEEDS[1] * 1.001
+        if float(scene.camera.pace) == 0:
+            assert np.ptp(rest, 0).max() < 1e-4
+            stood += 1
+    assert 0 < stood < 6
+    assert make(key, settings=settings).shake is None
+
+
 def test_a_plain_background_shows_nothing_but_objects():
     settings = SceneSettings(objects=2, speed=SPEEDS, plain=1.0)
     textures, plain = smooth_textures(), 0
@@ -382,6 +413,7 @@ def test_video_gives_each_time_its_picture(scenes):
     [
         ({"speed": (0.0, 100.0)}, "speed is 0 100, but is drawn log-uniformly"),
         ({"zoom": (1.0, 0.5)}, "the least first"), ({"pause": 1.5}, "a probability"),
+        ({"shake": -0.1}, "a probability"), ({"shake_pixels": (0.0, 1.0)}, "shake_pixels is 0 1"),
         ({"blur": (0.0, 0.5)}, "more than 0"),
         ({"objects": -1}, "objects is -1"), ({"tilt": -0.1}, "tilt"),
         ({"white": (0.9, 2.0)}, "white is 0.9 2"),

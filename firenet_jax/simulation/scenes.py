@@ -46,6 +46,11 @@ class SceneSettings:
     halt: float = 0.0
     """Probability that everything stops for good in the first third of the scene, to teach the
     network to remember."""
+    shake: float = 0.0
+    """Probability that the camera trembles, as in a hand or on a machine: edges come and go by less
+    than a pixel, or a few, while it moves or stands still."""
+    shake_pixels: tuple[float, float] = (0.2, 4.0)
+    """By how many pixels, drawn log-uniformly."""
     still: float = 0.0
     """Probability that the camera stands still all the time, if the scene has objects."""
     plain: float = 0.0
@@ -74,9 +79,9 @@ class SceneSettings:
 
     def __post_init__(self):
         """Raises SettingsError for invalid values."""
-        for name in ("speed", "zoom", "blur", "size", "softness", "gamma"):
+        for name in ("speed", "shake_pixels", "zoom", "blur", "size", "softness", "gamma"):
             check_range(name, getattr(self, name))
-        for name in ("pause", "halt", "still", "plain", "hdr"):
+        for name in ("pause", "halt", "shake", "still", "plain", "hdr"):
             if not 0 <= getattr(self, name) <= 1:
                 raise SettingsError(
                     f"{name} is {getattr(self, name)}, but is a probability, 0 to 1"
@@ -108,6 +113,7 @@ class Scene(NamedTuple):
 
     focal: jax.Array  # () pixels, also the distance of the background at rest
     camera: Motion
+    shake: Motion | None  # added to the camera's
     places: jax.Array  # (K + 1, 6) each plane's pose at rest: centre and rotation
     motions: Motion  # leading axis K + 1
     # One array for each plane: looked up in a stack of them, each would be copied every time.
@@ -157,6 +163,7 @@ def random_scene(
     depth = jnp.concatenate([jnp.ones(1), depth])
     focal = side * uniform((0.8, 1.6))
     camera = _camera_motion(camera_key, focal, side)
+    shake = _shake(jax.random.fold_in(camera_key, 1), side, settings)
     objects = jax.vmap(_object_motion, (0, None, 0))(
         jax.random.split(object_keys, planes), side, depth
     )
@@ -194,6 +201,7 @@ def random_scene(
     scene = Scene(
         focal=focal,
         camera=camera,
+        shake=shake,
         places=places,
         motions=objects,
         textures=tuple(canvases),
@@ -277,6 +285,18 @@ def _camera_motion(key: jax.Array, focal: jax.Array, side: float) -> Motion:
     return _waves(uniform, log_uniform, jnp.concatenate([across, along, turn]))
 
 
+def _shake(key: jax.Array, side: float, settings: SceneSettings) -> Motion | None:
+    """Sideways by few pixels, and so often that it is about as fast as the other motion."""
+    if not settings.shake:
+        return None
+    uniform, log_uniform = _dice(key, 5 + 18 * WAVES)
+    shakes = uniform((0.0, 1.0)) < settings.shake
+    across, speed = log_uniform(settings.shake_pixels), side * log_uniform((0.1, 2.0))
+    shares = jnp.append(uniform((0.3, 1.0), (2,)), jnp.zeros(4))
+    motion = _waves(uniform, log_uniform, jnp.where(shakes, across * shares, 0.0))
+    return motion._replace(frequency=motion.frequency * speed / across)
+
+
 def _object_motion(key: jax.Array, side: float, depth: jax.Array) -> Motion:
     """Across up to half of the picture, with a tumble."""
     uniform, log_uniform = _dice(key, 6 + 18 * WAVES)
@@ -353,6 +373,7 @@ def _at_pace(scene: Scene, camera: float, objects: jax.Array) -> Scene:
     """The scene with these paces, the objects' in parts of the camera's."""
     return scene._replace(
         camera=scene.camera._replace(pace=jnp.asarray(camera, jnp.float32)),
+        shake=scene.shake and scene.shake._replace(pace=jnp.asarray(camera, jnp.float32)),
         motions=scene.motions._replace(pace=camera * objects),
     )
 
@@ -368,7 +389,8 @@ def _at_speed(scene: Scene, speed, duration, height: int, width: int) -> Scene:
     def paced(scene, factor):
         objects = scene.motions._replace(pace=scene.motions.pace * factor)
         camera = scene.camera._replace(pace=scene.camera.pace * factor)
-        return scene._replace(camera=camera, motions=objects)
+        shake = scene.shake and scene.shake._replace(pace=scene.shake.pace * factor)
+        return scene._replace(camera=camera, shake=shake, motions=objects)
 
     def improve(round, carry):
         scene, _ = carry
@@ -425,6 +447,8 @@ def _to_image(scene: Scene, t: jax.Array, height: int, width: int) -> jax.Array:
     """Homographies (K + 1, 3, 3) at time t: coordinates on each plane -> the image's (x, y)."""
     clock = _clock(scene.pauses, jnp.asarray(t, jnp.float32))
     camera = _pose(scene.camera, clock)
+    if scene.shake is not None:
+        camera += _pose(scene.shake, clock)
     turn = _rotation(camera[3:])
     # Distances in parts of the focal length, so that all entries are of the order of 1.
     lens = jnp.stack(
