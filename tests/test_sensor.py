@@ -288,6 +288,7 @@ def test_faults_are_switched_on_but_what_is_given_stays():
     "choice, message",
     [
         ({"noise": (0.0, 10.0)}, "noise is 0 10, but is drawn log-uniformly"),
+        ({"noise_in_light": (0.0, 1.0)}, "noise_in_light is 0 1, but is drawn log-uniformly"),
         ({"leak": (0.5, 0.1)}, "the least first"), ({"hot": (0.5, 5.0)}, "part of the pixels"),
         ({"cutoff": (1.0, np.nan)}, "cutoff"), ({"threshold_range": (0.0, 1.0)}, "threshold_range"),
         ({"flicker": (0.5, 1.5)}, "light is not negative"),
@@ -317,7 +318,7 @@ def test_leaks_are_on_events_at_their_rate_and_not_all_at_once():
 
 def noisy_sensor(rate, on=0.2, off=0.17):
     phase = jax.random.uniform(jax.random.key(1), (H, W))
-    return plain_sensor(on, off)._replace(noise=jnp.array([rate, 0.25, 0.0]), phase=phase)
+    return plain_sensor(on, off)._replace(noise=jnp.array([rate, 0.25, 0.0, 0.0]), phase=phase)
 
 
 def test_shot_noise_has_its_rate_and_no_order():
@@ -333,13 +334,29 @@ def test_shot_noise_has_its_rate_and_no_order():
         assert spread.sum() == fired.sum() and spread.std() <= 0.1 * spread.mean()
 
 
-def test_shot_noise_falls_with_light_to_a_quarter():
-    for light, rate in ((0.0, 60.0), (0.5, 37.5), (1.0, 15.0)):
+@pytest.mark.parametrize(
+    "noise_in_light, rates",
+    [(None, (60.0, 37.5, 15.0)), ((0.25, 0.25), (60.0, 30.0, 15.0)), ((1.0, 1.0), (60.0,) * 3)],
+)
+def test_shot_noise_falls_with_light(noise_in_light, rates):
+    """Linearly to a quarter, or exponentially to what is said."""
+    sensor = with_only(4, noise=(60.0, 60.0), noise_in_light=noise_in_light)
+    for light, rate in zip((0.0, 0.5, 1.0), rates, strict=True):
         times = np.arange(0, 500_001, 10_000)
         images = np.full((len(times), H, W), light, np.float32)
-        chunks = event_list(noisy_sensor(60.0), zip(times, images, strict=True))
+        chunks = event_list(sensor, zip(times, images, strict=True))
         expected = 0.5 * rate * H * W
         assert abs(sum(map(len, chunks)) - expected) < 4 * np.sqrt(expected)
+
+
+def test_noise_in_light_is_drawn_from_its_range():
+    settings = replace(FAULTY, noise_in_light=(0.01, 0.5))
+    draw = partial(module.random_sensor, height=4, width=4, settings=settings)
+    noise = np.asarray(jax.vmap(draw)(jax.random.split(jax.random.key(3), 400)).noise)
+    (rate, light, _, steep), logs = noise.T, np.log(noise[:, 1])
+    assert (steep == 1).all() and np.log(light).min() >= np.log(0.0099)
+    assert light.max() <= 0.501 and abs(logs.mean() - np.log(0.01 * 0.5) / 2) < 0.2
+    assert abs(np.corrcoef(logs, np.log(rate))[0, 1]) < 0.2  # of each other's number
 
 
 def test_shot_noise_alternates_and_leaves_the_other_events_as_they_are():
@@ -636,7 +653,7 @@ def test_half_of_the_sequences_that_stop_for_good_are_noisy_in_any_light(texture
     sensors, scenes, durations = make(jax.random.key(4), textures)
     seconds = 1e-6 * np.asarray(durations)
     stopped = np.diff(scenes.pauses[:, 0, :2])[:, 0] > T * seconds
-    rate, light, drawn = np.asarray(sensors.noise).T
+    rate, light, drawn, _ = np.asarray(sensors.noise).T
     noisy = light == 1
     assert 0.35 < stopped.mean() < 0.65 and not noisy[~stopped].any()
     assert 0.3 < noisy[stopped].mean() < 0.7
@@ -648,12 +665,25 @@ def test_half_of_the_sequences_that_stop_for_good_are_noisy_in_any_light(texture
     assert (usual[:, 0] <= FAULTY.noise[1]).all()
 
 
+@pytest.mark.slow
+def test_of_sensors_whose_noise_shows_the_dark_fewer_are_equally_noisy_at_rest(textures):
+    sensor = replace(SETTINGS["sensor"], noise_in_light=(0.01, 0.5))
+    settings = SETTINGS | {"batch": 200, "sensor": sensor}
+    settings["scene"] = replace(SETTINGS["scene"], halt=1.0)
+    make = jax.jit(partial(module.random_setups, **settings))
+    sensors, _, durations = make(jax.random.key(4), textures)
+    rate, light, _, _ = np.asarray(sensors.noise).T
+    dark = (rate * 1e-6 * np.asarray(durations) > 0.0199) & (light < 1)
+    assert 0.1 < (light == 1).mean() < 0.3  # 0.4 of a half
+    assert dark.mean() > 0.2
+
+
 def test_noise_of_drawn_signs_adds_up_and_alternating_noise_does_not():
     ticks = jnp.int32(1000)
     grey = jnp.full((50, 60), 0.5)
     settings = replace(module.SensorSettings(), noise=(300.0, 300.0))
     alternating = module.random_sensor(jax.random.key(1), height=50, width=60, settings=settings)
-    drawn = alternating._replace(noise=jnp.array([300.0, 1.0, 1.0]))
+    drawn = alternating._replace(noise=jnp.array([300.0, 1.0, 1.0, 0.0]))
     sums = []
     for sensor in (alternating, drawn):
         state, votes = module.first_state(sensor, grey), []

@@ -56,7 +56,8 @@ NEARLY_NOISELESS = 2 / 3
 # Half of the sequences that stop for good have this much noise, in events per pixel and window,
 # equal in light and dark: at rest, windows with a fixed number of events hold nothing but noise. In
 # half of these the polarities are random instead of alternating: their sums look like contrast.
-AT_REST = (0.02, 1.0)
+# Of sensors whose noise shows what is dark, only this share is equal.
+AT_REST, EQUAL_AT_REST = (0.02, 1.0), 0.4
 
 
 Fault = TypeVar("Fault", float, tuple[float, float])
@@ -95,8 +96,11 @@ class SensorSettings:
     """Standard deviation of the thresholds between pixels, in log intensity; about 0.03 in real
     sensors."""
     noise: tuple[float, float] | None = None
-    """Shot noise: events per second of a pixel in the dark; in full light a quarter as many. ON and
-    OFF alternate. At most one per pixel between two renderings."""
+    """Shot noise: events per second of a pixel in the dark. ON and OFF alternate. At most one per
+    pixel between two renderings."""
+    noise_in_light: tuple[float, float] | None = None
+    """Shot noise in full light, relative to that in the dark; between them it falls exponentially
+    (default: linearly, to a quarter)."""
     leak: tuple[float, float] | None = None
     """Leak: ON events per second by which every pixel's reference drifts; about 0.1 in real
     sensors."""
@@ -123,6 +127,8 @@ class SensorSettings:
         for name in ("noise", "leak", "hot", "cutoff"):
             if _on(getattr(self, name)):
                 check_range(name, getattr(self, name))
+        if self.noise_in_light is not None:
+            check_range("noise_in_light", self.noise_in_light)
         if _on(self.flicker):
             check_range("flicker", self.flicker)
             if self.flicker[1] > 1:
@@ -191,8 +197,8 @@ class Sensor(NamedTuple):
     off: jax.Array
     refractory: jax.Array | None  # () int32, ticks
     drift: jax.Array | None  # (H, W) apparent rise of L in log intensity per second
-    noise: jax.Array | None  # (3,) events per second and pixel in the dark; factor in full light; 1
-    # if polarities are random, 0 if they alternate
+    noise: jax.Array | None  # (4,) events per second and pixel in the dark; factor in full light; 1
+    # if polarities are random, 0 if they alternate; 1 if it falls exponentially, 0 if linearly
     cutoff: jax.Array | None  # (2,) hertz in full light; factor in the dark
     phase: jax.Array | None  # (H, W) share of the first threshold already crossed where L drifts,
     # and whether noise starts with ON; otherwise all pixels would start with the same event
@@ -269,7 +275,11 @@ def random_sensor(
     silenced = settings.refractory_range is not None or settings.refractory != 0
     noise = cutoff = None
     if _on(settings.noise):
-        noise = jnp.stack([log_uniform(settings.noise), NOISE_IN_LIGHT, 0.0])
+        noise = jnp.stack([log_uniform(settings.noise), NOISE_IN_LIGHT, 0.0, 0.0])
+        if settings.noise_in_light is not None:
+            low, high = map(math.log, settings.noise_in_light)
+            light = jnp.exp(jax.random.uniform(jax.random.fold_in(key, 4), (), None, low, high))
+            noise = noise.at[1].set(light).at[3].set(1.0)
     if _on(settings.cutoff):
         cutoff = jnp.stack([log_uniform(settings.cutoff), settings.cutoff_dark])
     refractory = jnp.round(refractory * 1e6 * TICKS).astype(jnp.int32) if silenced else None
@@ -314,7 +324,7 @@ def _without_faults(sensor: Sensor, clean: jax.Array, spread: jax.Array) -> Sens
         off=unless(off, sensor.off),
         refractory=unless(refractory, sensor.refractory),
         drift=unless(0.0, sensor.drift),
-        noise=unless(jnp.array([0.0, NOISE_IN_LIGHT, 0.0]), sensor.noise),
+        noise=unless(jnp.array([0.0, NOISE_IN_LIGHT, 0.0, 0.0]), sensor.noise),
         cutoff=unless(jnp.array([1e9, 1.0]), sensor.cutoff),  # so high that it has no effect
         lamp=sensor.lamp and sensor.lamp._replace(swing=unless(0.0, sensor.lamp.swing)),
     )
@@ -395,8 +405,9 @@ def step(
     runs, noise_on = (run,), state.noise_on
     if sensor.noise is not None and noise_on is not None:
         key = jax.random.fold_in(sensor.key, state.renderings)
-        rate, light, drawn = sensor.noise
-        expected = seconds * rate * (1 - (1 - light) * image)
+        rate, light, drawn, steep = sensor.noise
+        falls = jnp.where(steep > 0, jnp.exp(jnp.log(light) * image), 1 - (1 - light) * image)
+        expected = seconds * rate * falls
         bits = jax.random.bits(key, image.shape, jnp.uint32)
         # The time of the event uses the upper 24 bits, so the lowest bit is independent of it.
         noise_on = jnp.where(drawn > 0, bits % 2 == 1, noise_on)
@@ -430,7 +441,8 @@ def _shot_noise(bits: jax.Array, expected: jax.Array, polarity: jax.Array, ticks
     """At most one event per pixel and interval, at any time in it; expected: (H, W) events; bits:
     (H, W) uint32, random.
 
-    The rate falls with light as in Hu, Liu and Delbruck, "v2e", CVPRW 2021. There noise moves the
+    By default the rate falls with light as in Hu, Liu and Delbruck, "v2e", CVPRW 2021; that of
+    photons falls much more steeply (Cao et al., "Noise2Image", 2024). In v2e noise moves the
     pixel's reference; here it has a reference of its own, because otherwise its polarity would
     depend on the last bits of L, and so on the device. It ignores the refractory period. One random
     number decides everything: if it is below the probability, it is uniform below it.
@@ -753,8 +765,10 @@ def _noisy_at_rest(
     rate = jnp.exp(low + (high - low) * share) / seconds
     chosen = (stopped & (noisy < 0.5))[:, None]
     drawn = noisy < 0.25
-    uniform = jnp.stack([rate, jnp.ones_like(rate), drawn.astype(rate.dtype)], -1)
-    return jnp.where(chosen, uniform, noise)
+    equal = jax.random.uniform(jax.random.fold_in(key, 1), rate.shape) < EQUAL_AT_REST
+    _, light, _, steep = noise.T
+    light = jnp.where((steep > 0) & ~equal, light, 1.0)
+    return jnp.where(chosen, jnp.stack([rate, light, 1.0 * drawn, steep], -1), noise)
 
 
 def window_bounds(durations: jax.Array, windows: int, first: jax.Array | int = 0) -> jax.Array:
