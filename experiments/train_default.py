@@ -595,6 +595,35 @@ WAKING = replace(
     scene=replace(CLEAR.scene, pause=0.1, halt=0.1),
     sensor=replace(CLEAR.sensor, clean=0.25),
 )
+# From what is built in: noise that shows what is dark, as that of real sensors does, and a camera
+# that shakes. Less error against cameras' frames and more contrast, at the price of memory. (Here
+# and in "night" darkness of noise at rest was drawn from 0.02 to 0.5.)
+DUSK = replace(
+    CLEAR,
+    steps=1100,
+    motion=(1.5, 24.0),
+    slow=0.12,
+    learning_rate=1e-3,
+    warmup=30,
+    seed=331,
+    validate_every=100,
+    loss=replace(
+        CLEAR.loss, contrast=5.0, ssim=1.3, equalised=3.0, equalised_mse=18.0, lambda_tc=6.0
+    ),
+    scene=replace(CLEAR.scene, halt=0.35, still=0.12, shake=0.4),
+    sensor=replace(CLEAR.sensor, clean=0.4, noise=(3e-3, 40.0), noise_in_light=(0.01, 0.5)),
+)
+# From half of that and half of what is built in, without the shake: memory comes back, and lasts
+# longer than before; in much noise that is equal everywhere images sink to black again.
+NIGHT = replace(
+    DUSK,
+    steps=950,
+    learning_rate=8e-4,
+    seed=337,
+    loss=replace(DUSK.loss, contrast=4.5),
+    scene=replace(CLEAR.scene, halt=0.45, still=0.1),
+    sensor=replace(DUSK.sensor, clean=0.42, noise=(3e-3, 30.0)),
+)
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
