@@ -40,6 +40,7 @@ def plain_sensor(on=0.2, off=0.17, refractory=0.0):
         refractory=jnp.int32(refractory * 1e6 * 1024) if refractory else None,
         drift=None,
         noise=None,
+        noise_slope=None,
         cutoff=None,
         phase=None,
         start=None,
@@ -318,7 +319,7 @@ def test_leaks_are_on_events_at_their_rate_and_not_all_at_once():
 
 def noisy_sensor(rate, on=0.2, off=0.17):
     phase = jax.random.uniform(jax.random.key(1), (H, W))
-    return plain_sensor(on, off)._replace(noise=jnp.array([rate, 0.25, 0.0, 0.0]), phase=phase)
+    return plain_sensor(on, off)._replace(noise=jnp.array([rate, 0.25, 0.0]), phase=phase)
 
 
 def test_shot_noise_has_its_rate_and_no_order():
@@ -352,11 +353,11 @@ def test_shot_noise_falls_with_light(noise_in_light, rates):
 def test_noise_in_light_is_drawn_from_its_range():
     settings = replace(FAULTY, noise_in_light=(0.01, 0.5))
     draw = partial(module.random_sensor, height=4, width=4, settings=settings)
-    noise = np.asarray(jax.vmap(draw)(jax.random.split(jax.random.key(3), 400)).noise)
-    (rate, light, _, steep), logs = noise.T, np.log(noise[:, 1])
-    assert (steep == 1).all() and np.log(light).min() >= np.log(0.0099)
-    assert light.max() <= 0.501 and abs(logs.mean() - np.log(0.01 * 0.5) / 2) < 0.2
-    assert abs(np.corrcoef(logs, np.log(rate))[0, 1]) < 0.2  # of each other's number
+    sensors = jax.vmap(draw)(jax.random.split(jax.random.key(3), 400))
+    logs, rates = np.asarray(sensors.noise_slope), np.asarray(sensors.noise)[:, 0]
+    assert logs.min() >= np.log(0.0099) and logs.max() <= np.log(0.501)
+    assert abs(logs.mean() - np.log(0.01 * 0.5) / 2) < 0.2
+    assert abs(np.corrcoef(logs, np.log(rates))[0, 1]) < 0.2  # of each other's number
 
 
 def test_shot_noise_alternates_and_leaves_the_other_events_as_they_are():
@@ -653,7 +654,7 @@ def test_half_of_the_sequences_that_stop_for_good_are_noisy_in_any_light(texture
     sensors, scenes, durations = make(jax.random.key(4), textures)
     seconds = 1e-6 * np.asarray(durations)
     stopped = np.diff(scenes.pauses[:, 0, :2])[:, 0] > T * seconds
-    rate, light, drawn, _ = np.asarray(sensors.noise).T
+    rate, light, drawn = np.asarray(sensors.noise).T
     noisy = light == 1
     assert 0.35 < stopped.mean() < 0.65 and not noisy[~stopped].any()
     assert 0.3 < noisy[stopped].mean() < 0.7
@@ -671,11 +672,11 @@ def test_of_sensors_whose_noise_shows_the_dark_fewer_are_equally_noisy_at_rest(t
     settings = SETTINGS | {"batch": 200, "sensor": sensor}
     settings["scene"] = replace(SETTINGS["scene"], halt=1.0)
     make = jax.jit(partial(module.random_setups, **settings))
-    sensors, _, durations = make(jax.random.key(4), textures)
-    rate, light, _, _ = np.asarray(sensors.noise).T
-    dark = (rate * 1e-6 * np.asarray(durations) > 0.0199) & (light < 1)
-    assert 0.1 < (light == 1).mean() < 0.3  # 0.4 of a half
-    assert dark.mean() > 0.2
+    sensors, _, _ = make(jax.random.key(4), textures)
+    noisy = np.asarray(sensors.noise)[:, 1] == 1
+    equal = np.asarray(sensors.noise_slope) == 0
+    assert 0.1 < equal.mean() < 0.3 and noisy[equal].all()  # 0.4 of a half
+    assert 0.2 < (noisy & ~equal).mean() < 0.4
 
 
 def test_noise_of_drawn_signs_adds_up_and_alternating_noise_does_not():
@@ -683,7 +684,7 @@ def test_noise_of_drawn_signs_adds_up_and_alternating_noise_does_not():
     grey = jnp.full((50, 60), 0.5)
     settings = replace(module.SensorSettings(), noise=(300.0, 300.0))
     alternating = module.random_sensor(jax.random.key(1), height=50, width=60, settings=settings)
-    drawn = alternating._replace(noise=jnp.array([300.0, 1.0, 1.0, 0.0]))
+    drawn = alternating._replace(noise=jnp.array([300.0, 1.0, 1.0]))
     sums = []
     for sensor in (alternating, drawn):
         state, votes = module.first_state(sensor, grey), []

@@ -197,8 +197,10 @@ class Sensor(NamedTuple):
     off: jax.Array
     refractory: jax.Array | None  # () int32, ticks
     drift: jax.Array | None  # (H, W) apparent rise of L in log intensity per second
-    noise: jax.Array | None  # (4,) events per second and pixel in the dark; factor in full light; 1
-    # if polarities are random, 0 if they alternate; 1 if it falls exponentially, 0 if linearly
+    noise: jax.Array | None  # (3,) events per second and pixel in the dark; factor in full light; 1
+    # if polarities are random, 0 if they alternate
+    noise_slope: jax.Array | None  # () of the noise's logarithm over intensity, in place of that
+    # factor; None: it falls linearly
     cutoff: jax.Array | None  # (2,) hertz in full light; factor in the dark
     phase: jax.Array | None  # (H, W) share of the first threshold already crossed where L drifts,
     # and whether noise starts with ON; otherwise all pixels would start with the same event
@@ -273,18 +275,17 @@ def random_sensor(
     else:
         refractory = jnp.float32(_or(settings.refractory, REFRACTORY))
     silenced = settings.refractory_range is not None or settings.refractory != 0
-    noise = cutoff = None
+    noise = slope = cutoff = None
     if _on(settings.noise):
-        noise = jnp.stack([log_uniform(settings.noise), NOISE_IN_LIGHT, 0.0, 0.0])
+        noise = jnp.stack([log_uniform(settings.noise), NOISE_IN_LIGHT, 0.0])
         if settings.noise_in_light is not None:
             low, high = map(math.log, settings.noise_in_light)
-            light = jnp.exp(jax.random.uniform(jax.random.fold_in(key, 4), (), None, low, high))
-            noise = noise.at[1].set(light).at[3].set(1.0)
+            slope = jax.random.uniform(jax.random.fold_in(key, 4), minval=low, maxval=high)
     if _on(settings.cutoff):
         cutoff = jnp.stack([log_uniform(settings.cutoff), settings.cutoff_dark])
     refractory = jnp.round(refractory * 1e6 * TICKS).astype(jnp.int32) if silenced else None
     lamp = _lamp(jax.random.fold_in(key, 3), shape, settings.flicker)
-    sensor = Sensor(on, off, refractory, drift, noise, cutoff, phase, start, lamp, noise_key)
+    sensor = Sensor(on, off, refractory, drift, noise, slope, cutoff, phase, start, lamp, noise_key)
     if not settings.clean:
         return sensor
     clean_key, plain_key = jax.random.split(jax.random.fold_in(key, 2))
@@ -324,7 +325,8 @@ def _without_faults(sensor: Sensor, clean: jax.Array, spread: jax.Array) -> Sens
         off=unless(off, sensor.off),
         refractory=unless(refractory, sensor.refractory),
         drift=unless(0.0, sensor.drift),
-        noise=unless(jnp.array([0.0, NOISE_IN_LIGHT, 0.0, 0.0]), sensor.noise),
+        noise=unless(jnp.array([0.0, NOISE_IN_LIGHT, 0.0]), sensor.noise),
+        noise_slope=unless(0.0, sensor.noise_slope),
         cutoff=unless(jnp.array([1e9, 1.0]), sensor.cutoff),  # so high that it has no effect
         lamp=sensor.lamp and sensor.lamp._replace(swing=unless(0.0, sensor.lamp.swing)),
     )
@@ -405,9 +407,11 @@ def step(
     runs, noise_on = (run,), state.noise_on
     if sensor.noise is not None and noise_on is not None:
         key = jax.random.fold_in(sensor.key, state.renderings)
-        rate, light, drawn, steep = sensor.noise
-        falls = jnp.where(steep > 0, jnp.exp(jnp.log(light) * image), 1 - (1 - light) * image)
-        expected = seconds * rate * falls
+        rate, light, drawn = sensor.noise
+        if sensor.noise_slope is None:
+            expected = seconds * rate * (1 - (1 - light) * image)
+        else:
+            expected = seconds * rate * jnp.exp(sensor.noise_slope * image)
         bits = jax.random.bits(key, image.shape, jnp.uint32)
         # The time of the event uses the upper 24 bits, so the lowest bit is independent of it.
         noise_on = jnp.where(drawn > 0, bits % 2 == 1, noise_on)
@@ -705,8 +709,7 @@ def random_setups(
         scenes = scenes._replace(textures=(ground, *scenes.textures[1:]))
     if scene.halt and sensors.noise is not None:
         rest_key = jax.random.fold_in(number_key, 2)
-        noise = _noisy_at_rest(rest_key, sensors.noise, scenes, windows, duration)
-        sensors = sensors._replace(noise=noise)
+        sensors = _noisy_at_rest(rest_key, sensors, scenes, windows, duration)
     return sensors, scenes, duration
 
 
@@ -755,20 +758,23 @@ def _uneven(sensors: Sensor, kind: jax.Array, is_slow: jax.Array, slow: float) -
 
 
 def _noisy_at_rest(
-    key: jax.Array, noise: jax.Array, scenes: Scene, windows: int | jax.Array, duration: jax.Array
-) -> jax.Array:
-    """The sensors' noise, replaced by that of `AT_REST` in half of the sequences that stop."""
+    key: jax.Array, sensors: Sensor, scenes: Scene, windows: int | jax.Array, duration: jax.Array
+) -> Sensor:
+    """The sensors, with the noise of `AT_REST` in half of the sequences that stop."""
     seconds = 1e-6 * duration
     stopped = scenes.pauses[:, 0, 1] - scenes.pauses[:, 0, 0] > windows * seconds
     low, high = (math.log(bound) for bound in AT_REST)
     noisy, share = jax.random.uniform(key, (2, len(duration)))
     rate = jnp.exp(low + (high - low) * share) / seconds
-    chosen = (stopped & (noisy < 0.5))[:, None]
+    chosen = stopped & (noisy < 0.5)
     drawn = noisy < 0.25
-    equal = jax.random.uniform(jax.random.fold_in(key, 1), rate.shape) < EQUAL_AT_REST
-    _, light, _, steep = noise.T
-    light = jnp.where((steep > 0) & ~equal, light, 1.0)
-    return jnp.where(chosen, jnp.stack([rate, light, 1.0 * drawn, steep], -1), noise)
+    uniform = jnp.stack([rate, jnp.ones_like(rate), drawn.astype(rate.dtype)], -1)
+    slope = sensors.noise_slope
+    if slope is not None:
+        equal = jax.random.uniform(jax.random.fold_in(key, 1), rate.shape) < EQUAL_AT_REST
+        slope = jnp.where(chosen & equal, 0.0, slope)
+    noise = jnp.where(chosen[:, None], uniform, sensors.noise)
+    return sensors._replace(noise=noise, noise_slope=slope)
 
 
 def window_bounds(durations: jax.Array, windows: int, first: jax.Array | int = 0) -> jax.Array:
