@@ -707,7 +707,7 @@ def random_setups(
         grey = jax.random.uniform(grey_key, (batch, 1, 1), minval=0.2, maxval=0.8)
         ground = jnp.where(is_swift[:, None, None], grey, scenes.textures[0])
         scenes = scenes._replace(textures=(ground, *scenes.textures[1:]))
-    if scene.halt and sensors.noise is not None:
+    if scene.halt:
         rest_key = jax.random.fold_in(number_key, 2)
         sensors = _noisy_at_rest(rest_key, sensors, scenes, windows, duration)
     return sensors, scenes, duration
@@ -760,7 +760,9 @@ def _uneven(sensors: Sensor, kind: jax.Array, is_slow: jax.Array, slow: float) -
 def _noisy_at_rest(
     key: jax.Array, sensors: Sensor, scenes: Scene, windows: int | jax.Array, duration: jax.Array
 ) -> Sensor:
-    """The sensors, with the noise of `AT_REST` in half of the sequences that stop."""
+    """The sensors, with the noise of `AT_REST` in half of the sequences that stop; if they have any."""
+    if sensors.noise is None:
+        return sensors
     seconds = 1e-6 * duration
     stopped = scenes.pauses[:, 0, 1] - scenes.pauses[:, 0, 0] > windows * seconds
     low, high = (math.log(bound) for bound in AT_REST)
