@@ -760,7 +760,7 @@ def _uneven(sensors: Sensor, kind: jax.Array, is_slow: jax.Array, slow: float) -
 def _noisy_at_rest(
     key: jax.Array, sensors: Sensor, scenes: Scene, windows: int | jax.Array, duration: jax.Array
 ) -> Sensor:
-    """The sensors, with the noise of `AT_REST` in half of the sequences that stop; if they have any."""
+    """The sensors, if noisy, with the noise of `AT_REST` in half of the sequences that stop."""
     if sensors.noise is None:
         return sensors
     seconds = 1e-6 * duration
