@@ -26,7 +26,7 @@ from firenet_jax.evaluation import metrics
 from firenet_jax.evaluation.equalise import equalise
 from firenet_jax.network import initial_state
 from firenet_jax.reconstruction import reconstruct
-from firenet_jax.simulation.sensor import sequences
+from firenet_jax.simulation.curricula import sequences
 from firenet_jax.simulation.textures import HELD_OUT, load_textures, photographs
 from firenet_jax.training.losses import Loss
 from firenet_jax.training.run import run

@@ -46,14 +46,13 @@ from firenet_jax.evaluation.equalise import equalise
 from firenet_jax.instants import WARM_UP
 from firenet_jax.network import State, Weights, initial_state
 from firenet_jax.reconstruction import reconstruct
+from firenet_jax.simulation.curricula import random_setups, window_bounds
 from firenet_jax.simulation.scenes import SceneSettings, render
 from firenet_jax.simulation.sensor import (
     FAULTY,
     SensorSettings,
     first_state,
-    random_setups,
     simulate,
-    window_bounds,
 )
 from firenet_jax.simulation.sensor import step as sensor_step
 from firenet_jax.simulation.textures import HELD_OUT, load_textures, photographs

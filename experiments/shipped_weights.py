@@ -38,8 +38,9 @@ from firenet_jax.instants import WARM_UP
 from firenet_jax.network import initial_state
 from firenet_jax.pictures import display, event_pictures, initial_display_state
 from firenet_jax.reconstruction import reconstruct
+from firenet_jax.simulation.curricula import sequences
 from firenet_jax.simulation.scenes import SceneSettings
-from firenet_jax.simulation.sensor import FAULTY, SensorSettings, sequences
+from firenet_jax.simulation.sensor import FAULTY, SensorSettings
 from firenet_jax.simulation.textures import HELD_OUT, load_textures, photographs
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -35,6 +35,7 @@ MODULES = {  # what is changed: the tests that must find it
     "training/losses.py": ["losses"],
     "evaluation/metrics.py": ["metrics"],
     "simulation/sensor.py": ["sensor"],
+    "simulation/curricula.py": ["curricula"],
 }
 EQUIVALENT = {  # (module, line after the change): why nothing changes
     (

@@ -10,8 +10,9 @@ from firenet_jax.checkpoint import convert, load_weights
 from firenet_jax.events import concatenate
 from firenet_jax.network import initial_state
 from firenet_jax.reconstruction import images_at, reconstruct
+from firenet_jax.simulation.curricula import random_setups, window_bounds
 from firenet_jax.simulation.scenes import video
-from firenet_jax.simulation.sensor import event_list, random_setups, window_bounds
+from firenet_jax.simulation.sensor import event_list
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.tensors import pack, voxelise
 

@@ -96,7 +96,7 @@ LARGER = {  # function: why
     "reconstruction.reconstruct_at": "what `reconstruct` takes, and the instants",
     "reconstruction.events_to_pictures": "one compiled program: what it is made for are options",
     "simulation.scenes.random_scene": "random numbers are handed out in one order, read as a list",
-    "simulation.sensor.random_setups": "one option a choice, all with defaults",
+    "simulation.curricula.random_setups": "one option a choice, all with defaults",
     "storage.pytorch_file._unpickle": "one case for each of the format's instructions",
     "tensors.pack": "one pass that fills arrays in place",
     "training.batches._example": "what a random example depends on",

@@ -20,8 +20,9 @@ from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.errors import OutputError
 from firenet_jax.events import Events
 from firenet_jax.network import Weights, initial_params
+from firenet_jax.simulation.curricula import window_bounds
 from firenet_jax.simulation.scenes import SceneSettings
-from firenet_jax.simulation.sensor import FAULTY, simulate, window_bounds
+from firenet_jax.simulation.sensor import FAULTY, simulate
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage.files import locked
 from firenet_jax.storage.sequence_file import Picture, write_sequence

@@ -15,8 +15,9 @@ import tyro
 from firenet_jax.devices import check_processes
 from firenet_jax.errors import SettingsError
 from firenet_jax.settings import check_range, check_seed
+from firenet_jax.simulation.curricula import check_rare
 from firenet_jax.simulation.scenes import SceneSettings
-from firenet_jax.simulation.sensor import FAULTY, SensorSettings, check_rare
+from firenet_jax.simulation.sensor import FAULTY, SensorSettings
 from firenet_jax.training.batches import Augment, is_set
 from firenet_jax.training.losses import DISTANCES, Loss
 from firenet_jax.training.step import StepSettings

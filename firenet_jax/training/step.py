@@ -25,15 +25,14 @@ from firenet_jax.convolution import CONVOLVED
 from firenet_jax.devices import BATCH, REPLICATED, TIME_BATCH, on_each_device, replicated, sharding
 from firenet_jax.evaluation import metrics
 from firenet_jax.network import State, initial_state, step
+from firenet_jax.simulation.curricula import random_setups, window_bounds
 from firenet_jax.simulation.scenes import SceneSettings
 from firenet_jax.simulation.sensor import (
     SensorSettings,
     SensorState,
     Simulation,
     first_states,
-    random_setups,
     simulate,
-    window_bounds,
 )
 from firenet_jax.tensors import normalise
 from firenet_jax.training.losses import Loss, sequence_loss
