@@ -124,9 +124,12 @@ def warming(
 
 
 def _in_order(times: Iterable[int]) -> Iterator[int]:
-    """Raises SettingsError if they are not in order: earlier events are no longer in memory."""
+    """Raises SettingsError if they are not in order, as earlier events are no longer in memory, or
+    not whole: then they may be seconds."""
     last = None
     for time in times:
+        if time != time // 1:  # NaN differs, too
+            raise SettingsError(f"times of images are whole microseconds, {time} is none")
         if last is not None and time < last:
             raise SettingsError(f"times of images come in order, but {time} us after {last} us")
         yield time

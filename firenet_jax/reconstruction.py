@@ -19,8 +19,9 @@ from jax.sharding import Mesh
 
 from firenet_jax import colour, native
 from firenet_jax.devices import BATCH, REPLICATED, TIME_BATCH, on_each_device
+from firenet_jax.errors import logger
 from firenet_jax.events import Events, Recording, check_recording
-from firenet_jax.instants import WARM_UP, Step, check, steps, warming
+from firenet_jax.instants import WARM_UP, Counts, Step, check, steps, warming
 from firenet_jax.network import (
     BINS,
     CHANNELS,
@@ -335,7 +336,8 @@ def images_at(
     state = initial_state(1, height, width)
     committed = Committed(state, state)
     first, cutter = warming(cut(recording, chosen), recording.pixels, warm_up)
-    entries = itertools.chain(first, steps(recording, chosen, times, cutter))
+    counts = Counts()
+    entries = itertools.chain(first, steps(recording, chosen, times, cutter, counts))
     for group in in_groups(entries, chunk):
         rows = [[step.events] for step in group] + [[Events.empty()]] * (chunk - len(group))
         size = capacity(sum(len(row[0]) for row in rows), size)
@@ -346,6 +348,12 @@ def images_at(
         if seen.size:
             found = np.array([group[i].time for i in seen], np.int64)
             yield found, np.asarray(images)[seen, 0]
+    if not counts.seen and counts.early + counts.late:
+        logger.warning(
+            "%s: no image, as no time is within the recording (%d before its first event, %d after "
+            "its last one): times are microseconds on its clock",
+            recording.path, counts.early, counts.late,
+        )  # fmt: skip
 
 
 def looks_of(groups: Sequence[Sequence[Step]], length: int) -> Looks:
@@ -406,7 +414,7 @@ def padding(height: int, width: int, multiple: int) -> tuple[tuple[int, int], tu
 
 @partial(
     jax.jit,
-    static_argnames=("height", "width", "network", "settings", "preview", "raw", "mesh"),
+    static_argnames=("height", "width", "network", "settings", "preview", "turned", "raw", "mesh"),
 )
 def events_to_pictures(
     weights: Weights,
@@ -420,6 +428,7 @@ def events_to_pictures(
     network: Network = Network(),
     settings: Display = Display(),
     preview: bool = False,
+    turned: bool = False,
     raw: bool = False,
     mesh: Mesh | None = None,
 ) -> tuple[Session, jax.Array]:
@@ -430,6 +439,7 @@ def events_to_pictures(
     beside the reconstruction.
     valid: (T, B) bool, as in `reconstruct`.
     steps: which steps are looks, for a session `at_times`; pictures of kept steps are undefined.
+    turned: the events are rotated by 180 degrees, and with them a sensor's colour filter array.
     raw: the network's images, (T, B, H, W) float32, in place of pictures.
     mesh: devices that share the B recordings equally, for events from `pack_for_devices`.
     """
@@ -471,14 +481,14 @@ def events_to_pictures(
         inputs = normalise(tensors) if early else tensors
         after, pictures = shown(weights, session, inputs, valid, steps)
         if network.color:
-            planes = colour.channels(inputs)  # (T, B, 3, H/2, W/2, 5)
+            planes = colour.channels(inputs, turned)  # (T, B, 3, H/2, W/2, 5)
             planes = planes.reshape(len(planes), -1, *planes.shape[3:])
             each = partial(jnp.repeat, repeats=3, axis=1)
             channels, shades = shown(
                 weights, _fold(session.channels), planes, *jax.tree.map(each, (valid, steps))
             )
             shades = shades.reshape(len(planes), -1, 3, *shades.shape[2:])
-            pictures = colour.coloured(pictures, shades)
+            pictures = colour.coloured(pictures, shades, turned)
             after = after._replace(channels=_unfold(channels))
         if preview:
             if not network.color:

@@ -32,6 +32,31 @@ def test_columns_of_every_kind(t, unit, p):
         assert columns_of(recording) == EXPECTED
 
 
+@pytest.mark.parametrize("kind", [np.int32, np.uint16, np.uint64, np.float32])
+def test_units_are_applied_to_wide_numbers(kind):
+    """int32 milliseconds overflow as microseconds after 36 minutes, float32 after 17 s."""
+    late = 60_000 if kind == np.uint16 else 2**24 - 1 if kind == np.float32 else 2**31 - 1
+    t = np.array([late - 2, late], kind)
+    units = {"ms": 1000} if kind != np.float32 else {"us": 1, "ms": 1000}
+    for unit, factor in units.items():
+        recording = fj.recording(t, [1, 2], [3, 4], [0, 1], unit=unit, **SIZE)
+        assert columns_of(recording)[0] == [factor * (late - 2), factor * late]
+    if kind == np.uint64:
+        with pytest.raises(ValueError, match="beyond 9007199254740 ms: is the unit right"):
+            fj.recording(t + np.uint64(2**62), [1, 2], [3, 4], [0, 1], unit="ms", **SIZE)
+
+
+def test_whole_floating_times_are_asked_about(tmp_path, caplog):
+    fj.recording(T / 1e6 + 0.25, X, Y, P, **SIZE)
+    assert not caplog.text
+    fj.recording(T.astype(float), X, Y, P, **SIZE)
+    assert "read as seconds, though whole ones" in caplog.text and 'unit="us"' in caplog.text
+    caplog.clear()
+    np.save(tmp_path / "a.npy", np.stack([T.astype(float), X, Y, P], 1))
+    fj.open_recording(tmp_path / "a.npy", (20, 24))
+    assert "store them as integers" in caplog.text
+
+
 @pytest.mark.parametrize("names", ["txyp", ["timestamp", "x", "y", "polarity"]])
 def test_a_structured_array(names):
     kind = np.dtype(

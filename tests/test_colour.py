@@ -6,17 +6,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 from skimage.color import lab2rgb, rgb2lab
 from test_tensors import random_events
 
 from firenet_jax import colour
 from firenet_jax.checkpoint import load_weights
+from firenet_jax.commands.reconstruct import Reconstruct, run
 from firenet_jax.events import concatenate
 from firenet_jax.network import Weights, initial_state
 from firenet_jax.pictures import Display, Range, display, initial_display_state
 from firenet_jax.reconstruction import Network, events_to_pictures, initial_session, reconstruct
 from firenet_jax.simulation.sensor import event_list, random_sensor
 from firenet_jax.tensors import normalise, pack, voxelise
+from firenet_jax.windows import Windows
 
 HEIGHT, WIDTH = 16, 20
 
@@ -37,6 +40,18 @@ def test_channels_are_the_pixels_of_the_mosaic():
     assert red.tolist() == [[0, 2, 4], [20, 22, 24]]
     assert green.tolist() == [[1, 3, 5], [21, 23, 25]]
     assert blue.tolist() == [[11, 13, 15], [31, 33, 35]]
+
+
+def test_a_rotated_mosaic_has_the_rotated_channels_and_colours():
+    rng = np.random.default_rng(2)
+    tensors = rng.standard_normal((1, 4, 6, 5))
+    found = colour.channels(tensors[:, ::-1, ::-1], turned=True)
+    np.testing.assert_array_equal(found, colour.channels(tensors)[..., ::-1, ::-1, :])
+    greys = rng.integers(90, 160, (8, 10)).astype(np.uint8)
+    shades = rng.integers(90, 160, (3, 4, 5)).astype(np.uint8)
+    found = colour.coloured(greys[::-1, ::-1], shades[:, ::-1, ::-1], turned=True)
+    expected = np.asarray(colour.coloured(greys, shades)).astype(int)
+    assert np.abs(np.asarray(found)[::-1, ::-1] - expected).max() <= 1
 
 
 def test_lightness_is_the_grey_pictures_and_colour_is_interpolated_between_its_pixels():
@@ -105,7 +120,8 @@ def test_preview_of_colours():
     np.testing.assert_array_equal(both[..., WIDTH:, :], plain)
 
 
-def test_a_red_bar_is_red():
+@pytest.mark.parametrize("flip", [False, True])
+def test_a_red_bar_is_red(tmp_path, flip):
     """Red pixels see a bright bar pass over black ground, green and blue ones see nothing."""
     height, width, count = 32, 64, 40
     sensor = random_sensor(jax.random.key(0), height=height, width=width)
@@ -117,13 +133,20 @@ def test_a_red_bar_is_red():
         return 1000 * t, image
 
     events = concatenate(list(event_list(sensor, map(rendering, range(count + 1)))))
-    cuts = np.searchsorted(events.t, range(0, 1000 * count + 1, 5000))
-    rows = [[events.select(slice(*pair))] for pair in zip(cuts, cuts[1:], strict=False)]
-    _, pictures = events_to_pictures(
-        load_weights(), initial_session(1, height, width, Network(color=True)), pack(rows),
-        np.ones((len(rows), 1), bool), height=height, width=width, network=Network(color=True),
+    recording = tmp_path / "a.npz"
+    t, x, y, p = events.t, events.x, events.y, events.p
+    np.savez(recording, t=t, x=x, y=y, p=p)
+    run(
+        Reconstruct(
+            (recording,), tmp_path / "out", windows=Windows(duration=5), warm_up=0, flip=flip,
+            network=Network(color=True), display=Display(range="fixed"),
+            sensor_size=f"{width}x{height}",
+        )
     )  # fmt: skip
-    red, green, blue = np.moveaxis(np.asarray(pictures[-1, 0], int), -1, 0)
+    with Image.open(max((tmp_path / "out").glob("*.png"))) as picture:
+        last = np.asarray(picture, int)
+    last = last[::-1, ::-1] if flip else last
+    red, green, blue = np.moveaxis(last, -1, 0)
     bar = slice(4, -4), slice(count - 9, count - 3)
     before = slice(4, -4), slice(count + 10, -2)  # beyond the halo of the bar
     assert min((red - green)[bar].mean(), (red - blue)[bar].mean()) > 15

@@ -393,6 +393,32 @@ def test_clips_of_common_formats_reach_from_black_to_white(tmp_path, suffix):
     assert np.diff([p.time for p in read]) == pytest.approx(1e5)
 
 
+@pytest.mark.parametrize(
+    "matrix, turns", [((0, 1, -1, 0), -1), ((-1, 0, 0, -1), 2), ((0, -1, 1, 0), 1)]
+)
+def test_clips_of_a_telephone_are_upright(tmp_path, matrix, turns):
+    """It writes what its sensor sees, and how a player should rotate it (ISO 14496-12, tkhd)."""
+    clip = tmp_path / "a.mp4"
+    ramp = np.add.outer(5 * np.arange(32), np.arange(64)).astype(np.uint8)
+    write_video(clip, [ramp, ramp], fps=10)
+    data = bytearray(clip.read_bytes())
+    a, b, c, d = (65536 * entry for entry in matrix)
+    rows = np.array([a, b, 0, c, d, 0, 0, 0, 1 << 30], ">i4").tobytes()
+    start = data.index(b"tkhd") + 44
+    assert len(rows) == 36 and data[start : start + 4] == b"\0\1\0\0"
+    data[start : start + 36] = rows
+    clip.write_bytes(data)
+    first, _ = (picture.image for picture in read_clip(clip))
+    expected = np.rot90(ramp, turns)
+    assert first.shape == expected.shape
+    assert np.abs(first.astype(int) - expected).max() <= 6
+    small, _ = (picture.image for picture in read_clip(clip, (20, 12)))
+    assert small.shape == (20, 12)
+    assert np.sign(np.diff(small.mean(0).astype(int)[[1, -2]])) == np.sign(
+        np.diff(expected.mean(0)[[1, -2]])
+    )
+
+
 # ---- What is wrong
 
 

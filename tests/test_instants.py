@@ -318,6 +318,16 @@ def test_nothing_recompiles_as_data_flows(weights, recording):
     assert reconstruct_at._cache_size() == 1 and voxelise._cache_size() <= 2
 
 
+def test_seconds_are_no_times(weights, recording, caplog):
+    for times in ([0.5], np.array([1e5, 5e5 + 0.7]), [float("nan")]):
+        with pytest.raises(ValueError, match="whole microseconds"):
+            list(images_at(weights, recording, times))
+    assert len(list(images_at(weights, recording, np.array([float(FIRST)])))) == 1
+    assert not caplog.text
+    assert not list(images_at(weights, recording, [0, 2**60]))
+    assert "1 before its first event, 1 after its last one" in caplog.text
+
+
 def test_impossible_choices(weights, recording):
     with pytest.raises(ValueError, match="chunk is 0"):
         next(images_at(weights, recording, [1], chunk=0))

@@ -91,6 +91,14 @@ def test_text_in_seconds_with_a_header():
     assert rows(found) == [(1, 3, 4, True), (1_500_000, 5, 6, False)]
 
 
+def test_text_in_seconds_stays_so_from_piece_to_piece():
+    pieces = [b"0.5 1 1 1\n", b"1 2 2 1\n", b"2 2 2 1\n"]
+    found = [events.t.tolist() for events in sources.decoded(pieces, "text")]
+    assert found == [[500_000], [1_000_000], [2_000_000]]
+    (found,) = sources.decoded([b"6e-1 1 1 1\n"], "text")
+    assert found.t.tolist() == [600_000]
+
+
 @pytest.mark.parametrize("text", [b"GET / HTTP/1.1\n", b"1 2 3 nonsense\n", b"1 99999 3 1\n"])
 def test_text_that_is_no_events_is_refused(text):
     with pytest.raises(RecordingError, match="lines of t x y p were expected"):
@@ -190,6 +198,21 @@ def test_replay_gives_events_when_they_would_have_come(tmp_path, speed):
     assert (np.diff(t) >= 0).all() and t[600] > t[599]
     lateness = (now - 100.0) - (t - t[0]) / 1e6 / speed
     assert lateness.min() > -1e-9 and lateness.max() < sources.SLICE + 1e-9
+
+
+def test_replay_goes_on_an_hour_after_a_clock_was_set(tmp_path):
+    chunk = some_events(300, seed=1)
+    chunk.t[100:] += 1_700_000_000_000_000
+    clock = Clock()
+    arrived = [
+        (clock.now, len(events))
+        for events in sources.replay(
+            recording_of(tmp_path, chunk), clock=clock, sleep=lambda _: clock.sleep(60)
+        )
+        if len(events)
+    ]
+    assert sum(count for _, count in arrived) == 300
+    assert 3600 <= arrived[-1][0] - 100 < 3800
 
 
 # ---- Windows
@@ -348,6 +371,9 @@ def test_a_recording_played(tmp_path, monkeypatch, capsys):
         ("udp://nowhere --sensor-size 20x12", "expected udp://HOST:PORT"),
         ("missing.bin --sensor-size 20x12", "no such file, and no source"),
         ("a.txt --replay --speed 0", "speed is 0.0"),
+        ("a.txt --replay --speed inf", "speed is inf"),
+        ("a.txt --replay --longest 0.0004", "longest"),
+        ("a.txt --replay --longest inf", "longest"),
         ("a.txt --replay --port 70000", "ports are 0 to 65535"),
     ],
 )

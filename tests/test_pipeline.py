@@ -425,6 +425,42 @@ def test_names_with_dots(tmp_path, weights):
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"run.1", "run.2", "b"}
 
 
+def test_what_lies_behind_a_dot_makes_no_file_of_a_recordings_folder(tmp_path, weights):
+    paths = [write_recording(tmp_path / f"cam.{side}.txt", 300) for side in ("left", "right")]
+    run(settings(weights, tuple(paths), tmp_path / "out"))
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"cam_left", "cam_right"}
+    bag = tmp_path / "b.bag"  # the folder of a recording
+    assert plan((bag, paths[0]), tmp_path / "out")[0] == tmp_path / "out" / "b"
+
+
+@pytest.mark.parametrize("how", ["itself", "linked", "around", "of several"])
+def test_a_recording_is_never_replaced(tmp_path, weights, how):
+    """Its output may have its name, as events and images both are .h5 and .bag."""
+    folder = tmp_path / "hqf"
+    folder.mkdir()
+    paths = [folder / name for name in ("a.h5", "b.h5")]
+    for path in paths:
+        with h5py.File(path, "w") as file:
+            for name, kind in (("ts", "i8"), ("xs", "i2"), ("ys", "i2"), ("ps", "?")):
+                file[f"events/{name}"] = np.arange(500).astype(kind) % 20
+            file["events/ts"][:] = np.arange(500)
+            file.attrs["sensor_resolution"] = np.array([HEIGHT, WIDTH])
+    before = [path.read_bytes() for path in paths]
+    inputs, output = (paths[0],), paths[0]
+    if how == "linked":
+        inputs = (tmp_path / "link.h5",)
+        inputs[0].symlink_to(paths[0])
+    elif how == "around":
+        output = folder.rename(tmp_path / "hqf.ros2")
+        paths = [output / path.name for path in paths]
+        inputs = (paths[0],)
+    elif how == "of several":
+        inputs, output = tuple(paths), tmp_path / "hqf.h5"
+    with pytest.raises(OutputError, match="a recording that is read .*: choose another output"):
+        run(settings(weights, inputs, output, overwrite=True))
+    assert [path.read_bytes() for path in paths] == before
+
+
 def test_nothing_runs_on_after_an_error_that_is_kept(tmp_path, weights, monkeypatch):
     """As a notebook keeps the last one, and with it all that was going on."""
     recording = write_recording(tmp_path / "a.txt", 30_000)

@@ -138,3 +138,11 @@ def test_triggers(recording):
 def test_impossible_choices(choice, said):
     with pytest.raises(ValueError, match=said):
         replace(Times(), **choice)
+
+
+def test_a_part_of_the_recording_has_the_same_times(tmp_path, recording):
+    """--start and --stop cut, what times count from stays."""
+    (tmp_path / "times.txt").write_text("0.25\n0.5\n1.000001\n")
+    part = recording_of(T[600:])
+    found = times_of(Times(at=tmp_path / "times.txt"), recording, part.events())
+    assert found.tolist() == WANTED

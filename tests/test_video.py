@@ -299,3 +299,29 @@ def test_pictures_closer_than_a_gif_can_tell_play_slower(tmp_path):
         writer.write(picture, 10_000 * number)  # a gif's players show 50 per second at most
     writer.finish()
     assert writer.slower == pytest.approx(2)
+
+
+@pytest.mark.parametrize("name, most", [("a.mp4", 2**28 / 90_000), ("a.gif", 655.35)])
+def test_a_pause_longer_than_a_video_can_hold_is_cut(tmp_path, name, most, caplog):
+    """As of a clock that was set to today's time while it recorded."""
+    times = [0, 40_000, *(1_700_000_000_000_000 + np.array([0, 40_000, 100_000]))]
+    writer = open_writer(tmp_path / name)
+    for picture, time in zip(ramp(5), times, strict=True):
+        writer.write(picture, int(time))
+    writer.finish()
+    with av.open(str(tmp_path / name)) as container:
+        shown = [float(frame.pts * frame.time_base) for frame in container.decode(video=0)]
+    np.testing.assert_allclose(
+        shown, np.array([0, 0.04, 0.04, 0.08, 0.14]) + most * (np.arange(5) > 1), atol=1e-3
+    )
+    assert caplog.text.count("pauses are cut to") == 1
+
+
+def test_what_the_encoder_refuses_is_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr("firenet_jax.storage.video.LONGEST_STEP", {".mp4": 2**40})
+    writer = open_writer(tmp_path / "a.mp4")
+    with pytest.raises(OutputError, match="a.mp4: cannot be encoded"):
+        for number, picture in enumerate(ramp(100)):
+            writer.write(picture, 36_000_000_000 * number)
+        writer.finish()
+    writer.abandon()

@@ -71,6 +71,7 @@ class Way(NamedTuple):
     network: Network = Network()
     display: Display = Display()
     preview: bool = False
+    turned: bool = False  # the events are rotated by 180 degrees
     raw: bool = False  # write the network's float32 images
     at_times: bool = False  # images at given times
     chunk: int | None = None  # steps of a recording per call of the device; None: `chunk_for`
@@ -354,7 +355,8 @@ def computed(
             )
         session, shown = events_to_pictures(
             weights, session, events, chunk.valid, chunk.looks, height=height, width=width,
-            network=way.network, settings=way.display, preview=way.preview, raw=way.raw, mesh=mesh,
+            network=way.network, settings=way.display, preview=way.preview, turned=way.turned,
+            raw=way.raw, mesh=mesh,
         )  # fmt: skip
         states = {}
         if time.monotonic() - kept > RESUME_EVERY:

@@ -1,6 +1,7 @@
 """Live events -> live pictures on a local web page."""
 
 import json
+import math
 import sys
 import time
 from collections.abc import Iterator
@@ -70,12 +71,12 @@ class Live:
     display: Display = Display()
 
     def __post_init__(self):
-        for name in ("speed", "repeat", "behind", "longest"):
-            if not getattr(self, name) > 0:
+        for name in ("speed", "repeat", "behind"):
+            if not 0 < getattr(self, name) < math.inf:
                 raise SettingsError(f"{name} is {getattr(self, name)}, but must be more than 0")
         if not 0 <= self.port < 2**16:
             raise SettingsError(f"port is {self.port}, but ports are 0 to 65535")
-        Windows(events_per_pixel=self.events_per_pixel)  # checks it
+        Windows(events_per_pixel=self.events_per_pixel, longest=self.longest)  # checks them
 
 
 def source_of(settings: Live) -> sources.Source:

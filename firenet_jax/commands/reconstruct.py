@@ -30,7 +30,7 @@ from firenet_jax.reconstruction import Network
 from firenet_jax.settings import parse_size
 from firenet_jax.storage.arrays import ArraysWriter
 from firenet_jax.storage.bag import BagWriter, check_topic
-from firenet_jax.storage.files import OutputError, identity, named
+from firenet_jax.storage.files import OutputError, check_apart, identity, named
 from firenet_jax.storage.progress import Bytes, bar
 from firenet_jax.storage.resume import done_file, is_done, read_position
 from firenet_jax.storage.runs import recorded
@@ -43,6 +43,7 @@ from firenet_jax.storage.video import (
     check_output,
     check_rate,
     followed,
+    like_a_file,
     open_writer,
 )
 from firenet_jax.windows import DEFAULT_LONGEST, Windows, in_words, usual
@@ -183,6 +184,7 @@ def run(settings: Reconstruct) -> list[Path]:
         return []
     for output in outputs:  # before opening recordings: some are read whole to infer their size
         check_free(output)
+        check_apart(output, settings.recordings)
         if not done_file(output).is_file():
             check_output(output, settings.overwrite)
     outcome = Outcome()
@@ -207,10 +209,17 @@ def run(settings: Reconstruct) -> list[Path]:
 def do_all(jobs: list[Job], settings: Reconstruct, weights: Weights, outcome: Outcome) -> None:
     """Does jobs of any sensor sizes, with one progress bar."""
     way = Way(
-        settings.network, settings.display, settings.preview, settings.output.suffix == ".h5",
-        settings.times.wanted, settings.chunk, settings.batch, len(settings.recordings) > 1,
-        settings.overwrite,
-    )  # fmt: skip
+        network=settings.network,
+        display=settings.display,
+        preview=settings.preview,
+        turned=settings.flip and settings.network.color,  # else it would compile anew
+        raw=settings.output.suffix == ".h5",
+        at_times=settings.times.wanted,
+        chunk=settings.chunk,
+        batch=settings.batch,
+        several=len(settings.recordings) > 1,
+        overwrite=settings.overwrite,
+    )
     counts = [job.recording.count for job in jobs if job.recording.count is not None]
     partly = settings.start or settings.stop or settings.windows.step
     known = None if len(counts) < len(jobs) or partly else sum(counts)
@@ -237,6 +246,8 @@ def plan(recordings: tuple[Path, ...], output: Path) -> list[Path]:
     if len(recordings) == 1:
         return [followed(output)]
     stems = [_stem(named(path)) for path in recordings]
+    if output.suffix not in WHOLE:
+        stems = [_of_a_folder(stem) for stem in stems]
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
     if twice:
         raise OutputError(
@@ -245,6 +256,12 @@ def plan(recordings: tuple[Path, ...], output: Path) -> list[Path]:
     if output.suffix in WHOLE:
         return [followed(output.with_suffix("") / f"{stem}{output.suffix}") for stem in stems]
     return [followed(output / stem) for stem in stems]
+
+
+def _of_a_folder(stem: str) -> str:
+    """A name that no file has: `cam.left` -> `cam_left`."""
+    before, dot, after = stem.rpartition(".")
+    return f"{before}_{after}" if before and like_a_file(Path(f"a.{after}")) else stem
 
 
 def _stem(path: Path) -> str:

@@ -94,8 +94,9 @@ def times_of(
 ) -> np.ndarray | Grid | None:
     """The times of the images, in order; None: one image per window.
 
-    chunks: the recording's events, after filters in time; read up to the first event for a rate,
-    and to the end to determine the unit of a file. Raises RecordingError for an invalid file of
+    chunks: its events after filters in time, the first of which a rate counts from. The times of a
+    file count from the recording's first event, whatever part is asked for; to determine their unit
+    it is read to its end. Raises RecordingError for an invalid file of
     times, and for a recording without frames or triggers.
     """
     if not wanted.wanted:
@@ -112,7 +113,7 @@ def times_of(
             )
         return np.unique(np.asarray(recording.frames.times, np.int64))
     if wanted.at is not None:
-        return _from_file(wanted.at, wanted, recording, chunks)
+        return _from_file(wanted.at, wanted, recording)
     return _triggers(wanted, recording)
 
 
@@ -141,9 +142,7 @@ def _triggers(wanted: Times, recording: Recording) -> np.ndarray:
 # ---- A file of times
 
 
-def _from_file(
-    path: Path, wanted: Times, recording: Recording, chunks: Iterable[Events]
-) -> np.ndarray:
+def _from_file(path: Path, wanted: Times, recording: Recording) -> np.ndarray:
     numbers, unit, since_start = read_times(path)
     unit = wanted.unit or unit
     since_start = since_start if wanted.since is None else wanted.since == "start"
@@ -151,9 +150,9 @@ def _from_file(
     if not unit and any("." in number or "e" in number.lower() for number in numbers):
         units = ["s"]
     origins = [False, True] if since_start is None else [since_start]
-    first, last = _span(chunks, whole=len(units) * len(origins) > 1)
+    first, last = _span(recording.events(), whole=len(units) * len(origins) > 1)
     if first is None:
-        raise RecordingError(f"{recording.path}: no events, or none that the filters let pass")
+        raise RecordingError(f"{recording.path}: holds no events")
 
     found = []
     for name in units:

@@ -5,7 +5,8 @@ yields empty ones, so that whoever listens can act on time. Bytes are decoded by
 
     t64_x16_y16_on8   13 bytes an event: t u64 microseconds, x u16, y u16, polarity u8
     t32_x16_y15_on1   8 bytes: t u32 microseconds (wraps round), x u16, (y << 1 | polarity) u16
-    text              a line: t x y p; t in seconds where it has a decimal point, else microseconds
+    text              a line: t x y p; t in microseconds, but in seconds from the first one on that
+                      has a decimal point or an exponent
 
 All little-endian. The binary ones are those that faery sends and receives over UDP, so its
 converters and camera programs can feed this one; text is what everything can write.
@@ -26,6 +27,7 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Recording
+from firenet_jax.windows import MAX_GAP
 
 TICK = 0.005  # seconds between two looks at a source that has nothing
 SLICE = 0.002  # seconds of a replay that arrive together
@@ -60,9 +62,10 @@ def replay(
     """A recording's events when they would have come, `speed` times as fast, `repeat` times.
 
     Times go on from one round to the next. Where this machine reads more slowly than that, events
-    come as fast as they can be read.
+    come as fast as they can be read. A pause, as of a clock that was set while it recorded,
+    lasts no longer than an hour.
     """
-    begun, first, shift, last = clock(), None, 0, 0
+    begun, first, latest, shift, last = clock(), None, None, 0, 0
     part = max(1, round(1e6 * SLICE * speed))  # microseconds of the recording in a slice
     for _ in range(repeat):
         beginning = True
@@ -72,11 +75,12 @@ def replay(
                 shift = last + part - int(chunk.t[0])
             beginning = False
             t = chunk.t + shift
-            ends = np.arange(t[0] + part, t[-1] + part, part)
-            stops = np.unique([*np.searchsorted(t, ends), len(t)])
+            latest = int(t[0]) if latest is None else latest
+            stops = np.flatnonzero(np.diff((t - t[0]) // part)) + 1
             start = 0
-            for stop in stops[stops > 0].tolist():
-                due = begun + (int(t[stop - 1]) - first) / 1e6 / speed
+            for stop in (*stops.tolist(), len(t)):
+                begun -= max(int(t[start]) - latest - MAX_GAP, 0) / 1e6 / speed
+                due, latest = begun + (int(t[stop - 1]) - first) / 1e6 / speed, int(t[stop - 1])
                 while (wait := due - clock()) > 0:
                     sleep(min(wait, TICK))
                     if wait > TICK:
@@ -163,7 +167,7 @@ def decoded(pieces: Iterable[bytes], wire: str, datagrams: bool = False) -> Iter
     datagrams: each piece is of whole events, and what is left over of one is none.
     Raises RecordingError for text that is no events.
     """
-    decode = _text if wire == "text" else _Binary(BINARY[wire])
+    decode = _Text() if wire == "text" else _Binary(BINARY[wire])
     rest = b""
     for piece in pieces:
         events, rest = decode(rest + piece) if piece else (NO_EVENTS, rest)
@@ -197,25 +201,31 @@ class _Binary:
         return Events(t, x, y, on), data[whole:]
 
 
-def _text(data: bytes) -> tuple[Events, bytes]:
-    lines, _, rest = data.rpartition(b"\n")
-    rows = [line.split() for line in lines.splitlines()]
-    rows = [row for row in rows if len(row) not in (0, 2) and not row[0].startswith(b"#")]
-    if not rows:
-        return NO_EVENTS, rest
-    try:
-        seconds = any(b"." in row[0] for row in rows)
-        t, x, y, p = np.array(rows, np.float64).T
-        t = np.rint(1e6 * t if seconds else t)
-        if not (np.abs(t) < 2**53).all() or not (np.abs([x, y]) < 2**15).all():
-            raise ValueError("numbers too large")
-    except ValueError as error:
-        shown = b" ".join(rows[0])[:60].decode(errors="replace")
-        raise RecordingError(
-            f"the stream holds {shown!r} where lines of t x y p were expected ({error}): is "
-            f"--wire right? It may be {', '.join(BINARY)}"
-        ) from error
-    return Events(t.astype(np.int64), x.astype(np.int16), y.astype(np.int16), p > 0), rest
+class _Text:
+    """Remembers that times are in seconds: of a stream's pieces some may hold whole ones alone."""
+
+    def __init__(self):
+        self.seconds = False
+
+    def __call__(self, data: bytes) -> tuple[Events, bytes]:
+        lines, _, rest = data.rpartition(b"\n")
+        rows = [line.split() for line in lines.splitlines()]
+        rows = [row for row in rows if len(row) not in (0, 2) and not row[0].startswith(b"#")]
+        if not rows:
+            return NO_EVENTS, rest
+        try:
+            self.seconds |= any(b"." in row[0] or b"e" in row[0].lower() for row in rows)
+            t, x, y, p = np.array(rows, np.float64).T
+            t = np.rint(1e6 * t if self.seconds else t)
+            if not (np.abs(t) < 2**53).all() or not (np.abs([x, y]) < 2**15).all():
+                raise ValueError("numbers too large")
+        except ValueError as error:
+            shown = b" ".join(rows[0])[:60].decode(errors="replace")
+            raise RecordingError(
+                f"the stream holds {shown!r} where lines of t x y p were expected ({error}): is "
+                f"--wire right? It may be {', '.join(BINARY)}"
+            ) from error
+        return Events(t.astype(np.int64), x.astype(np.int16), y.astype(np.int16), p > 0), rest
 
 
 # ---- Cameras

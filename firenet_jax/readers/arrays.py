@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from firenet_jax.errors import RecordingError
-from firenet_jax.events import Events, Recording, Rows, checked
-from firenet_jax.readers import in_chunks, to_events
+from firenet_jax.events import MAX_TIME, Events, Recording, Rows, checked
+from firenet_jax.readers import in_chunks, to_events, warn_of_whole_seconds
 from firenet_jax.readers.text import NAMES
 
 UNITS = {"s": None, "ms": 1000, "us": 1}  # in microseconds; seconds become float64
@@ -82,7 +82,15 @@ def _in_unit(name: str, t: np.ndarray, unit: str | None) -> np.ndarray:
     if t.dtype.kind not in "iuf":
         raise RecordingError(f"{name}: t is {t.dtype}, expected numbers")
     if unit is None:
+        warn_of_whole_seconds(Path(name), t, 'pass unit="us"')
         return t
     if unit == "s":
         return t.astype(np.float64)
-    return t * UNITS[unit] if t.dtype.kind in "iu" else t * (UNITS[unit] / 1e6)
+    if t.dtype.kind == "f":
+        return t.astype(np.float64) * (UNITS[unit] / 1e6)
+    if UNITS[unit] == 1:
+        return t
+    most = MAX_TIME // UNITS[unit]
+    if int(t.min()) < -most or int(t.max()) > most:
+        raise RecordingError(f"{name}: t is beyond {most} {unit}: is the unit right?")
+    return t.astype(np.int64) * UNITS[unit]

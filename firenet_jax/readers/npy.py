@@ -31,6 +31,7 @@ from firenet_jax.readers import (
     text,
     to_events,
     to_frame,
+    warn_of_whole_seconds,
 )
 
 # layout: files of times, coordinates, polarities, frame times
@@ -53,11 +54,12 @@ def read(path: Path, columns: str | None = None) -> Source:
     layout = _layout(path)
     if layout is None:
         order = "txyp" if columns is None else "".join(_order(path, columns))
-        count = len(_of_one_file(path, order)[0])
+        t, *_ = _of_one_file(path, order)
+        warn_of_whole_seconds(path, t, "store them as integers: a structured array, or .npz")
         return Source(
             f"numpy {path.suffix.lower()}",
             lambda: _rows(path, _of_one_file(path, order)),
-            count=count,
+            count=len(t),
         )
     if columns is not None:
         raise RecordingError(

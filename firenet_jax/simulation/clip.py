@@ -42,11 +42,14 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
                         "convert the clip to a constant rate"
                     )
                 last = time
-                height, width = size or (frame.height, frame.width)
+                turns = getattr(frame, "rotation", 0) // 90 % 4  # of a telephone held upright
+                shape = size or ((frame.height, frame.width)[:: -1 if turns % 2 else 1])
+                height, width = shape[::-1] if turns % 2 else shape
                 # By way of RGB: the grey plane of a video does not reach from 0 to 255.
                 rgb = frame.to_ndarray(format="rgb24", width=width, height=height)
                 grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
-                yield Picture(time, np.round(grey).astype(np.uint8), None)
+                upright = np.rot90(np.round(grey).astype(np.uint8), turns)
+                yield Picture(time, np.ascontiguousarray(upright), None)
     except (FFmpegError, OSError, UnicodeDecodeError) as error:  # names in it that are no text
         reason = getattr(error, "strerror", None) or error
         raise PictureError(

@@ -7,6 +7,7 @@ the error names it.
 import contextlib
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,18 @@ def forbidden(path: str | Path) -> str:
         f"{path}: permission denied: give yourself the right to it (chmod u+rwX), or use a copy or "
         "place that is yours"
     )
+
+
+def check_apart(output: Path, inputs: Iterable[Path]) -> None:
+    """Raises OutputError if an input is this output or lies in it, as it would be replaced."""
+    for path in inputs:
+        with contextlib.suppress(OSError, RuntimeError):  # a loop of links is reported elsewhere
+            same = output.exists() and path.exists() and output.samefile(path)
+            if same or path.resolve().is_relative_to(output.resolve()):
+                where = "is" if same else "holds"
+                raise OutputError(
+                    f"{output}: {where} a recording that is read ({path}): choose another output"
+                )
 
 
 @contextlib.contextmanager

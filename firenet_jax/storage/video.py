@@ -17,10 +17,11 @@ from typing import Any, TextIO
 
 import av
 import numpy as np
+from av.error import FFmpegError
 from av.filter import Graph
 from PIL import Image
 
-from firenet_jax.errors import OutputError
+from firenet_jax.errors import OutputError, logger
 from firenet_jax.storage import bag
 from firenet_jax.storage.files import lock_file, locked, partial_name, writing
 
@@ -38,6 +39,9 @@ OURS = re.compile(r"timestamps\.txt|resume[.\w]*\.npz|(frame_\d{10,}|\d{19})\.pn
 RATES = 0.01, 10_000  # pictures per second
 GIF_RATE = 100  # pictures per second, the most that the format can express
 MP4_CLOCK = 90_000  # ticks per second, as is usual
+# Ticks between two pictures. An mp4 has 31 bits for the time between a picture and one that the
+# encoder puts four places before it.
+LONGEST_STEP = {".mp4": 2**28, ".gif": 2**16 - 1}
 USUAL_RATE = 30  # pictures per second, the encoder's nominal rate without --fps
 PNG_LEVEL = 4  # on grey pictures 25 % faster than the default 6, files 2 % larger
 
@@ -66,12 +70,17 @@ def check_rate(path: Path, fps: float) -> None:
         raise OutputError(f"fps is {fps:g}, but must be between {RATES[0]:g} and {RATES[1]:g}")
 
 
+def like_a_file(path: Path) -> bool:
+    """Whether a path ends as names of files do, and is no folder whose name happens to."""
+    if path.suffix.lower() in (*WHOLE, *OTHER_FILES):
+        return True
+    return LIKE_A_FILE.fullmatch(path.suffix) is not None and not path.is_dir()
+
+
 def check_output(path: Path, overwrite: bool) -> None:
     """Raises OutputError if this cannot be an output, or something is there that must not or cannot
     be replaced. Makes the folder that it will be in."""
-    other = path.suffix.lower() in (*WHOLE, *OTHER_FILES)
-    other |= LIKE_A_FILE.fullmatch(path.suffix) is not None and not path.is_dir()
-    if other and path.suffix not in WHOLE:
+    if path.suffix not in WHOLE and like_a_file(path):
         raise OutputError(
             f"{path}: cannot write {path.suffix} files: name a folder (for png), .mp4, .gif, .h5, "
             ".bag or .ros2"
@@ -232,7 +241,8 @@ class VideoWriter:
     """Pictures -> mp4 (H.264) or gif, all of one size.
 
     With `fps` all are shown equally long; without, from their own time to that of the next, `speed`
-    times as fast, but not closer to each other than the format can express.
+    times as fast, but not closer to each other than the format can express, nor farther apart: of a
+    longer pause the rest is left out, and a warning says so.
     Raises OutputError where the file cannot be written, or another run writes it.
     """
 
@@ -247,6 +257,7 @@ class VideoWriter:
         self.speed, self.timed = speed, fps is None
         self.first = self.last = 0  # times of pictures, microseconds
         self.at = -1  # ticks, where the last picture is
+        self.left_out = 0  # ticks of pauses
         self.count = 0
         with writing(path):
             self.held = self.partial.open("ab")
@@ -287,19 +298,44 @@ class VideoWriter:
             layout = "rgb24"
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=layout)
         self.first, self.last = (time if self.at < 0 else self.first), time
-        since = Fraction((time - self.first) / self.speed / 1e6) / self.tick
-        self.at = max(self.at + self.least, round(since)) if self.timed else self.count
-        frame.pts, frame.time_base = (0 if self.count == 0 else self.at), self.tick
-        self.at = frame.pts
+        self.at = self._next() if self.count else 0
+        frame.pts, frame.time_base = self.at, self.tick
         self.count += 1
         if self.filter:
             self.filter.vpush(frame)
             frame = self.filter.vpull()
-        with writing(self.path):
+        with self._encoding():
             self.container.mux(stream.encode(frame))
 
+    def _next(self) -> int:
+        """Where the picture that follows is shown, in ticks."""
+        if not self.timed:
+            return self.count
+        since = Fraction((self.last - self.first) / self.speed / 1e6) / self.tick
+        wanted = max(self.at + self.least, round(since) - self.left_out)
+        latest = self.at + LONGEST_STEP[self.path.suffix]
+        if wanted > latest:
+            if not self.left_out:
+                logger.warning(
+                    "%s: pauses are cut to %.0f minutes, about the longest that a video can hold",
+                    self.path, (latest - self.at) * self.tick / 60,
+                )  # fmt: skip
+            self.left_out += wanted - latest
+        return min(wanted, latest)
+
+    @contextlib.contextmanager
+    def _encoding(self):
+        """What the encoder or the disk refuses -> OutputError."""
+        try:
+            with writing(self.path):
+                yield
+        except FFmpegError as error:
+            raise OutputError(
+                f"{self.path}: cannot be encoded ({error}): choose another output"
+            ) from error
+
     def finish(self) -> None:
-        with writing(self.path):
+        with self._encoding():
             if self.stream is not None:
                 self.container.mux(self.stream.encode(None))
             self.container.close()
