@@ -117,7 +117,8 @@ def in_browser(folder: Path, browser: str, options: tuple[str, ...] = WITHOUT_GP
 
 def pictures_of_python(recording: Path, folder: Path) -> np.ndarray:
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        assert cli.main(["reconstruct", str(recording), "-o", str(folder), "--range", "fixed"]) == 0
+        line = ["reconstruct", str(recording), "-o", str(folder), "--range", "fixed"]
+        assert cli.main([*line, "--warm-up", "0"]) == 0
     return np.stack([np.asarray(Image.open(path)) for path in sorted(folder.glob("*.png"))])
 
 

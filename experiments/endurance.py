@@ -1,6 +1,6 @@
 """How do weights behave over length, density, rest and contrast, beside those of others?
 
-    python experiments/endurance.py WEIGHTS... [--recordings FOLDER] [--only NAMES]      40 minutes
+    python experiments/endurance.py WEIGHTS... [--recordings FOLDER] [--only NAMES]      60 minutes
 
 WEIGHTS: "built-in", and files of others (the published checkpoint, FireNet+, ...); a name may be
 given, ours=PATH. The questions, each a function, an entry of results/endurance.json and a table:

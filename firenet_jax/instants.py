@@ -11,10 +11,11 @@ length that ends at that time:
 If a share s of W[k+1] has passed at t, the look takes the last 1 - s of W[k] and the part of W[k+1]
 so far, from the state (1 - s) S[k-1] + s S[k], roughly the state at the start of that window. For
 s = 0 this is the step that keeps W[k], for s = 1 the one that keeps W[k+1], so images change
-smoothly across kept steps. No image depends on which others are requested, or on the future. (A
-look at the part of W[k+1] alone, from S[k], would have hardly any events just after a kept window.)
+smoothly across kept steps. No image depends on which others are requested, or on the future except
+through the warm-up below. (A look at the part of W[k+1] alone, from S[k], would have hardly any
+events just after a kept window.)
 
-A network that has seen nothing is grey. As a recording is there as a whole, the network can be
+A network that has seen nothing is grey. As the whole recording is available, the network can be
 shown its first windows beforehand, forwards and then backwards in time (`warming`): then it is back
 at the beginning, with a state that knows the scene.
 """

@@ -5,8 +5,8 @@ pictures (T, B, H, W, 3) uint8. Sharpened by an unsharp mask, stretched from an 
 0..255, clipped, if asked for smoothed, and rounded. (The original truncates to 8 bits, which
 darkens by half a level.)
 
-By default the range follows the images, because events tell contrast only in units of the sensor's
-threshold: how black and how white a scene is, no network can know.
+By default the range follows the images, because events encode contrast only in units of the
+sensor's contrast threshold: no network can know how black and how white a scene is.
 """
 
 import math

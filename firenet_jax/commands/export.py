@@ -27,11 +27,12 @@ KINDS = ".onnx", ".stablehlo", ".pth", ".safetensors"
 
 @dataclass(frozen=True)
 class Export:
-    """Write the network or its weights in a format of other programs.
+    """Write the network, or its weights, in a format that other programs read.
 
-    .onnx is the network for onnxruntime, TensorRT, OpenVINO and browsers; .stablehlo the network
-    for jax without this package; .pth the weights for rpg_e2vid, EVREAL and other PyTorch programs;
-    .safetensors the same weights for other libraries. This needs the extra `export`.
+    A file in .onnx is the network for onnxruntime, TensorRT, OpenVINO and browsers; in .stablehlo,
+    the network for jax without this package; in .pth, the weights for rpg_e2vid, EVREAL and other
+    PyTorch programs; in .safetensors, the same weights for other libraries. This needs the extra
+    `export`.
 
     Examples:
       firenet export -o firenet.onnx --picture

@@ -35,8 +35,8 @@ LARGEST = 1 << 28  # bytes of a file of times
 
 @dataclass(frozen=True)
 class Times:
-    """Images at given times instead of one per window. Choose at most one of --rate, --at,
-    --between-frames and --triggers."""
+    """Images at given times instead of one per window. Of --rate, --at, --between-frames
+    and --triggers, choose at most one."""
 
     rate: float | None = None
     """Images per second, from the first event on."""

@@ -1,4 +1,4 @@
-"""Image -> equalised image: histogram equalisation of a whole image, of surroundings, of tiles.
+"""Image -> equalised image: by its histogram, local ones (neighbourhoods), or CLAHE (tiles).
 
 Reconstructions and ground truths are often equalised before they are compared, because a
 reconstruction's brightness and contrast are arbitrary. Images are (..., H, W), nominally 0 to 1;

@@ -1,8 +1,8 @@
 """Image, ground truth -> LPIPS, by weights from files that the user names.
 
 Learned perceptual image patch similarity (Zhang et al. 2018), version 0.1, with AlexNet or
-SqueezeNet 1.1: a distance, 0 if equal; AlexNet's is what papers usually print. Two files of
-PyTorch make it, read without PyTorch and not part of this package: the network as torchvision
+SqueezeNet 1.1: a distance, 0 if equal; papers usually report AlexNet's. It needs two PyTorch
+files, read without PyTorch and not part of this package: the network as torchvision
 publishes it (alexnet-owt-*.pth, squeezenet1_1-*.pth) and the linear layers of the `lpips` package
 (lpips/weights/v0.1/alex.pth, squeeze.pth). Files of version 0.0 have the same names and shapes:
 nothing here tells them apart.

@@ -3,7 +3,7 @@
 The protocol is EVREAL's for the paper's data. Window i holds the events between frames i-1 and i.
 Reconstruction begins 10 s before the part that counts. A prediction has the time of its window's
 last event (of its end, if the window is empty) and counts if that is within 1 ms of a frame. Images
-at given times are looks at these times, while the state advances by windows of fixed size
+at given times are steps whose new state is discarded; the state advances by windows of fixed size
 (instants.py). Frames and predictions are compared as (H, W) float32, clipped to 0 to 1, optionally
 after histogram equalisation. `Protocol` changes each of these.
 """

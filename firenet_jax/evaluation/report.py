@@ -1,7 +1,7 @@
 """Results of an evaluation -> table, CSV, one page of HTML that needs nothing else.
 
 Results are the dictionary that `evaluate` writes as results.json: settings, numbers of each
-sequence, method and frame, means; a number that is not there is None, and its entry says why under
+sequence, method and frame, means; a missing number is None, and its entry says why under
 "gaps" (or, for all of a method's numbers, "gap"). The page holds its pictures, videos, curves and
 style; it loads no script and nothing from elsewhere.
 """

@@ -1,4 +1,4 @@
-"""Numbers of each frame -> means over sequences and frames; a gap says why one is not there."""
+"""Numbers of each frame -> means over sequences and frames; a gap says why a number is missing."""
 
 from typing import NamedTuple
 

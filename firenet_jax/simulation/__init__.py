@@ -4,7 +4,7 @@
     scenes         textures and motion -> intensity at any time, with exact flow
     sensor         intensity -> events, or event tensors that never leave the device
     curricula      which sensors look at which scenes: the sequences of a training
-    clip           a video file -> what a sensor may look at instead of a scene
+    clip           a video file -> grey pictures, the sensor's input in place of a scene
 
 Read `scenes` first, then `sensor.step`: one model of a pixel with all its faults.
 """

@@ -1,4 +1,4 @@
-"""A video file -> its pictures in grey, as a sensor may look at them."""
+"""A video file -> its pictures in grey: input of the simulated sensor, in place of a scene."""
 
 from collections.abc import Iterator
 from fractions import Fraction

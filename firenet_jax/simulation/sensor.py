@@ -15,7 +15,7 @@ may last two seconds. (An event in the last half microsecond of a window is stam
 window's end. The tensor on the device includes it; cutting the list into [start, end) puts it into
 the next window.)
 
-Light that flickers is the sensor's too: the truth does not show it.
+Flickering light is part of the sensor model, not of the scene: ground-truth images do not show it.
 
 Images are (H, W) float32 in [0, 1]. Sensors, states and runs are those of one sequence; `jax.vmap`
 makes batches.
@@ -62,9 +62,9 @@ def _on(fault: Fault | None) -> TypeGuard[Fault]:
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """The sensor: by default that of the paper, without faults. Pairs are (least, greatest), drawn
-    log-uniformly for each sequence. A fault is off if it is 0 or not given, unless all faults are
-    on.
+    """The sensor: by default that of the paper, without faults; in `firenet train`, with the faults
+    whose defaults are given below. Pairs are (least, greatest), drawn log-uniformly for each
+    sequence. A fault is off if it is 0, or if it has no default and --faults does not set it.
     """
 
     threshold: float | None = None
@@ -100,8 +100,8 @@ class SensorSettings:
     cutoff_dark: float = 0.1
     """Bandwidth in the dark, relative to full light; 1: independent of light."""
     flicker: tuple[float, float] | None = None
-    """Light of a lamp or screen that flickers at 60 to 240 Hz: how far it rises and falls, relative
-    to its mean, as a sinusoid. It is strongest at a random place. Not among all faults."""
+    """Sinusoidal flicker of a lamp or screen at 60 to 240 Hz: its amplitude relative to the mean
+    intensity, greatest at a random point of the image. Not set by --faults."""
     clean: float = 0.0
     """Share of the sequences with the paper's thresholds and none of these faults."""
     mid_recording: bool = False

@@ -1,7 +1,7 @@
 """Losses and pictures of a run -> log.jsonl, TensorBoard, png files, weights.
 
-The first process writes; the others only read what is there. A log goes on after a checkpoint:
-lines that came after it are dropped.
+The first process writes; the others only read what is there. When a run resumes from a
+checkpoint, log lines written after that checkpoint are dropped.
 """
 
 import contextlib

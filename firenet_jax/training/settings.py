@@ -76,7 +76,7 @@ class Train:
     learning_rate: float = 1e-3
     """Peak learning rate, after the warm-up; it then decays to a hundredth along a cosine."""
     warmup: int = 200
-    """Steps of the linear warm-up (default: 200, at most a fifth of the run)."""
+    """Steps of the linear warm-up. If it is not chosen, at most a fifth of the run."""
     optimiser: Literal["muon", "adam"] = "muon"
     """muon learns more per step (experiments/compare_optimisers.py); the paper used adam. The
     learning rate has the same scale for both: the size of an update."""
