@@ -634,6 +634,16 @@ GLOAMING = replace(
     loss=replace(NIGHT.loss, equalised_mse=16.0),
     sensor=replace(NIGHT.sensor, clean=0.4),
 )
+# From half of "night" and half of "gloaming": dense windows, mostly clean. The card's clean rows come
+# back, and equalised figures of cameras' frames are better than before; memory is not.
+DAWN = replace(
+    BARING,
+    steps=1300,
+    seed=347,
+    loss=replace(BARING.loss, contrast=4.0, equalised=4.0),
+    scene=replace(BARING.scene, halt=0.25, still=0.05),
+    sensor=replace(BARING.sensor, noise=(3e-3, 30.0), noise_in_light=(0.01, 0.5)),
+)
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
