@@ -634,8 +634,8 @@ GLOAMING = replace(
     loss=replace(NIGHT.loss, equalised_mse=16.0),
     sensor=replace(NIGHT.sensor, clean=0.4),
 )
-# From half of "night" and half of "gloaming": dense windows, mostly clean. The card's clean rows come
-# back, and equalised figures of cameras' frames are better than before; memory is not.
+# From half of "night" and half of "gloaming": dense windows, mostly clean. The card's clean rows
+# come back, and equalised figures of cameras' frames are better than before; memory is not.
 DAWN = replace(
     BARING,
     steps=1300,
