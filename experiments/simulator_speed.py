@@ -18,14 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from harness import interleaved, save, table
 
+from firenet_jax.simulation.curricula import sequences
 from firenet_jax.simulation.scenes import SceneSettings, random_scene, rendering_times, video
-from firenet_jax.simulation.sensor import (
-    FAULTY,
-    SensorSettings,
-    event_list,
-    random_sensor,
-    sequences,
-)
+from firenet_jax.simulation.sensor import FAULTY, SensorSettings, event_list, random_sensor
 from firenet_jax.simulation.textures import load_textures
 
 BATCH, WINDOWS, SIZE, RENDERINGS = 4, 20, 128, 5
