@@ -56,6 +56,10 @@ class Counts:
     early: int = 0  # before the first event
     late: int = 0  # after the last event; 0 for an endless grid
 
+    @property
+    def outside(self) -> str:
+        return f"{self.early} before its first event, {self.late} after its last one"
+
 
 def steps(
     recording: Recording,

@@ -350,9 +350,8 @@ def images_at(
             yield found, np.asarray(images)[seen, 0]
     if not counts.seen and counts.early + counts.late:
         logger.warning(
-            "%s: no image, as no time is within the recording (%d before its first event, %d after "
-            "its last one): times are microseconds on its clock",
-            recording.path, counts.early, counts.late,
+            "%s: no image is wanted while it lasts (%s): times are microseconds on its clock",
+            recording.path, counts.outside,
         )  # fmt: skip
 
 

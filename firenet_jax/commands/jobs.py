@@ -136,13 +136,13 @@ class Running:
 
 def told(recording: Recording, counts: Counts) -> RecordingError | None:
     """Says which times lie outside the recording; an error where all do."""
-    outside = f"{counts.early} before its first event, {counts.late} after its last one"
     if not counts.seen:
         return RecordingError(
-            f"{recording.path}: no image is wanted while it lasts ({outside}): choose other times"
+            f"{recording.path}: no image is wanted while it lasts ({counts.outside}): choose other "
+            "times"
         )
     if counts.early or counts.late:
-        logger.warning("%s: times without an image: %s", recording.path, outside)
+        logger.warning("%s: times without an image: %s", recording.path, counts.outside)
     return None
 
 

@@ -260,8 +260,8 @@ def plan(recordings: tuple[Path, ...], output: Path) -> list[Path]:
 
 def _of_a_folder(stem: str) -> str:
     """A name that no file has: `cam.left` -> `cam_left`."""
-    before, dot, after = stem.rpartition(".")
-    return f"{before}_{after}" if before and like_a_file(Path(f"a.{after}")) else stem
+    suffix = Path(stem).suffix
+    return f"{Path(stem).stem}_{suffix[1:]}" if like_a_file(suffix) else stem
 
 
 def _stem(path: Path) -> str:

@@ -96,8 +96,9 @@ def times_of(
 
     chunks: its events after filters in time, the first of which a rate counts from. The times of a
     file count from the recording's first event, whatever part is asked for; to determine their unit
-    it is read to its end. Raises RecordingError for an invalid file of
-    times, and for a recording without frames or triggers.
+    it is read to its end.
+    Raises RecordingError for an invalid file of times, and for a recording without frames or
+    triggers.
     """
     if not wanted.wanted:
         return None

@@ -233,20 +233,6 @@ def frame_times(path: Path, times: np.ndarray) -> np.ndarray:
     return times.astype(np.int64) if times.dtype.kind in "iu" else microseconds(times)
 
 
-SNIFFED_TIMES = 1000
-
-
-def warn_of_whole_seconds(path: Path, t: np.ndarray, remedy: str) -> None:
-    """Floating times are seconds; where the first are whole ones, a warning asks for the unit."""
-    first = np.asarray(t[:SNIFFED_TIMES])
-    if first.dtype.kind == "f" and first.size > 1 and first[0] != first[-1]:
-        if (first == np.rint(first)).all():
-            logger.warning(
-                "%s: floating times: read as seconds, though whole ones; if they are microseconds, "
-                "%s", path, remedy,
-            )  # fmt: skip
-
-
 def to_events(
     path: Path, row: int, t, x, y, p, *, place: Callable[[int], str] = event_number
 ) -> Events | Rows:

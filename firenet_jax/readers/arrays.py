@@ -8,8 +8,8 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import MAX_TIME, Events, Recording, Rows, checked
-from firenet_jax.readers import in_chunks, to_events, warn_of_whole_seconds
-from firenet_jax.readers.text import NAMES
+from firenet_jax.readers import in_chunks, to_events
+from firenet_jax.readers.text import NAMES, warn_of_whole_seconds
 
 UNITS = {"s": None, "ms": 1000, "us": 1}  # in microseconds; seconds become float64
 

@@ -31,7 +31,6 @@ from firenet_jax.readers import (
     text,
     to_events,
     to_frame,
-    warn_of_whole_seconds,
 )
 
 # layout: files of times, coordinates, polarities, frame times
@@ -55,7 +54,7 @@ def read(path: Path, columns: str | None = None) -> Source:
     if layout is None:
         order = "txyp" if columns is None else "".join(_order(path, columns))
         t, *_ = _of_one_file(path, order)
-        warn_of_whole_seconds(path, t, "store them as integers: a structured array, or .npz")
+        text.warn_of_whole_seconds(path, t, "store them as integers: a structured array, or .npz")
         return Source(
             f"numpy {path.suffix.lower()}",
             lambda: _rows(path, _of_one_file(path, order)),

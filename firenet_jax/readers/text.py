@@ -235,7 +235,20 @@ def other_order(columns: np.ndarray) -> str | None:
 
 def _whole_seconds(rows: list[list[str]], column: int) -> bool:
     words = [row[column] for row in rows if column < len(row) and _is_number(row[column])]
-    return len(set(words)) > 1 and all(float(word).is_integer() for word in words)
+    return _whole([float(word) for word in words])
+
+
+def _whole(seconds: list[float]) -> bool:
+    return len(set(seconds)) > 1 and all(map(float.is_integer, seconds))
+
+
+def warn_of_whole_seconds(path: Path, t: np.ndarray, remedy: str) -> None:
+    """Floating times are seconds; a warning says so where the first of them are whole ones."""
+    if t.dtype.kind == "f" and _whole(t[:SNIFFED].astype(float).tolist()):
+        logger.warning(
+            "%s: floating times: read as seconds, though whole ones; if they are microseconds, %s",
+            path, remedy,
+        )  # fmt: skip
 
 
 def _is_number(word: str) -> bool:

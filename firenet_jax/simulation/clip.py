@@ -43,8 +43,8 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
                     )
                 last = time
                 turns = getattr(frame, "rotation", 0) // 90 % 4  # of a telephone held upright
-                shape = size or ((frame.height, frame.width)[:: -1 if turns % 2 else 1])
-                height, width = shape[::-1] if turns % 2 else shape
+                stored = size[::-1] if size and turns % 2 else size  # before it is turned
+                height, width = stored or (frame.height, frame.width)
                 # By way of RGB: the grey plane of a video does not reach from 0 to 255.
                 rgb = frame.to_ndarray(format="rgb24", width=width, height=height)
                 grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)

@@ -70,17 +70,16 @@ def check_rate(path: Path, fps: float) -> None:
         raise OutputError(f"fps is {fps:g}, but must be between {RATES[0]:g} and {RATES[1]:g}")
 
 
-def like_a_file(path: Path) -> bool:
-    """Whether a path ends as names of files do, and is no folder whose name happens to."""
-    if path.suffix.lower() in (*WHOLE, *OTHER_FILES):
-        return True
-    return LIKE_A_FILE.fullmatch(path.suffix) is not None and not path.is_dir()
+def like_a_file(suffix: str) -> bool:
+    """Whether names of files end so."""
+    return suffix.lower() in (*WHOLE, *OTHER_FILES) or LIKE_A_FILE.fullmatch(suffix) is not None
 
 
 def check_output(path: Path, overwrite: bool) -> None:
     """Raises OutputError if this cannot be an output, or something is there that must not or cannot
     be replaced. Makes the folder that it will be in."""
-    if path.suffix not in WHOLE and like_a_file(path):
+    happens = path.is_dir() and path.suffix.lower() not in (*WHOLE, *OTHER_FILES)
+    if path.suffix not in WHOLE and like_a_file(path.suffix) and not happens:
         raise OutputError(
             f"{path}: cannot write {path.suffix} files: name a folder (for png), .mp4, .gif, .h5, "
             ".bag or .ros2"
@@ -256,7 +255,7 @@ class VideoWriter:
             self.least = 2 if gif else MP4_CLOCK // 1000
         self.speed, self.timed = speed, fps is None
         self.first = self.last = 0  # times of pictures, microseconds
-        self.at = -1  # ticks, where the last picture is
+        self.at = 0  # ticks, where the last picture is
         self.left_out = 0  # ticks of pauses
         self.count = 0
         with writing(path):
@@ -297,7 +296,7 @@ class VideoWriter:
             picture = np.stack([picture] * 3, -1) if picture.ndim == 2 else picture
             layout = "rgb24"
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=layout)
-        self.first, self.last = (time if self.at < 0 else self.first), time
+        self.first, self.last = (self.first if self.count else time), time
         self.at = self._next() if self.count else 0
         frame.pts, frame.time_base = self.at, self.tick
         self.count += 1
@@ -346,7 +345,7 @@ class VideoWriter:
 
     def abandon(self) -> None:
         """Removes the partial file: a video cannot be continued."""
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, FFmpegError):
             self.container.close()
         if os.name == "nt":
             self.held.close()
