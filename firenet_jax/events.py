@@ -170,52 +170,77 @@ def checked(
 
     Time must not run backwards, within a chunk or between chunks. x and y must not be negative or
     lie outside the sensor, if its size is known. Of rows out of order, as few as possible are
-    dropped. At the end, `say(sentence, count)` reports what was dropped, and damage that ended the
-    reading early. Raises RecordingError for the first bad row if more than one in a thousand rows
-    so far are bad, and for damage before the first event; with `strict`, for any bad row or damage.
-    `place(row)` names a row (counted from 0 over the whole recording) in the file's own terms, such
-    as "line 7".
+    dropped, of those at the end of a chunk, too: it is passed on when the next one has come. At the
+    end, `say(sentence, count)` reports what was dropped, and damage that ended the reading early.
+    Raises RecordingError for the first bad row if more than one in a thousand rows so far are bad,
+    and for damage before the first event; with `strict`, for any bad row or damage. `place(row)`
+    names a row (counted from 0 over the whole recording) in the file's own terms, such as "line 7".
     """
-    rows, dropped, last, first_error = 0, 0, None, None
+    rows, dropped, first_error = 0, 0, None
+    held, before = Events.empty(), -MAX_TIME  # a chunk that waits, and the last time before it
     try:
-        chunks = iter(chunks)
-        while True:
-            try:
-                chunk = next(chunks, None)
-            except RecordingError as error:
+        for chunk in _with_damage(chunks):
+            if isinstance(chunk, RecordingError):
+                yield from _unless_empty(held)
                 if strict or rows == dropped:
-                    raise
-                say(f"{error}; what comes before is read: {counted(rows - dropped, 'event')}", rows)
-                return
-            if chunk is None:
+                    raise chunk
+                what = f"what comes before is read: {counted(rows - dropped, 'event')}"
+                say(f"{chunk}; {what}", rows)
                 return
             events = chunk if isinstance(chunk, Events) else chunk.events
             if len(events) == 0:
                 continue
-            last = events.t[0] if last is None else last
+            last = held.t[-1] if len(held) else before
             if isinstance(chunk, Events) and _is_right(events, last, height, width):
-                rows, last = rows + len(events), events.t[-1]
-                yield events
+                rows, before = rows + len(events), last
+                yield from _unless_empty(held)
+                held = events
                 continue
-            bad = chunk.bad if isinstance(chunk, Rows) else np.zeros(len(events), bool)
             first, error = _first_error(chunk, path, last, height, width, place, rows)
-            bad = bad | _outside(events, height, width)
-            fewest = bad | _out_of_order(events.t, bad, last)
-            count = int(fewest.sum())
+            bad = _known(chunk) | _outside(events, height, width)
+            wrong, fewest = _fewest(held, events, bad, before)
+            count = int(wrong.sum() + fewest.sum())
             if strict or dropped + count > MAX_BAD_SHARE * (rows + len(events)):
+                yield from _unless_empty(held)
                 if first:  # so that a caller who stops before the damage never meets it
                     yield events.select(slice(first))
                 dropped = 0  # the error already says it
                 raise error
             first_error = first_error or error
             rows, dropped = rows + len(events), dropped + count
-            events = events.select(~fewest)
-            if len(events):
-                last = events.t[-1]
-                yield events
+            held = held.select(~wrong) if wrong.any() else held
+            before = held.t[-1] if len(held) else before
+            yield from _unless_empty(held)
+            held = events.select(~fewest)
+        yield from _unless_empty(held)
     finally:
         if dropped:
             say(f"{first_error}; left out: {dropped:,} of {counted(rows, 'event')}", rows)
+
+
+def _with_damage(chunks: Iterable[Events | Rows]) -> Iterator[Events | Rows | RecordingError]:
+    """The chunks, and then the error that ended them."""
+    try:
+        yield from chunks
+    except RecordingError as error:
+        yield error
+
+
+def _unless_empty(events: Events) -> tuple[Events, ...]:
+    return (events,) if len(events) else ()
+
+
+def _fewest(
+    held: Events, events: Events, bad: np.ndarray, before: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of the events held, which are right and follow the time `before`, and of the next ones: which
+    to leave out, (N,) bool each, among them those in `bad`, so that the rest is in order."""
+    last = held.t[-1] if len(held) else before
+    if (~bad & (events.t < last)).sum() <= 1:  # to blame the end of those held gains nothing
+        return np.zeros(len(held), bool), bad | _out_of_order(events.t, bad, last)
+    known = np.append(np.zeros(len(held), bool), bad)
+    out = known | _out_of_order(np.append(held.t, events.t), known, before)
+    return out[: len(held)], out[len(held) :]
 
 
 def _is_right(events: Events, last: int, height: int | None, width: int | None) -> bool:
@@ -228,6 +253,10 @@ def _is_right(events: Events, last: int, height: int | None, width: int | None) 
         and (width is None or x.max() < width)
         and (height is None or y.max() < height)
     )
+
+
+def _known(chunk: Events | Rows) -> np.ndarray:
+    return chunk.bad if isinstance(chunk, Rows) else np.zeros(len(chunk), bool)
 
 
 def _outside(events: Events, height: int | None, width: int | None) -> np.ndarray:
@@ -271,7 +300,7 @@ def _first_error(
 ) -> tuple[int, RecordingError]:
     """The first bad row of a chunk, and its error; rows: number of rows before the chunk."""
     events = chunk if isinstance(chunk, Events) else chunk.events
-    known = chunk.bad if isinstance(chunk, Rows) else np.zeros(len(events), bool)
+    known = _known(chunk)
     t, x, y = events.t, events.x, events.y
     steps = np.diff(t, prepend=last)
     row = int(np.argmax(known | (steps < 0) | _outside(events, height, width)))

@@ -80,3 +80,22 @@ def test_time_goes_on_from_the_last_event_that_was_kept():
     times = [t for part in found for t, _ in part]
     assert times == [*range(2000), *range(1999, 10998)]
     assert len(said) == 1 and "left out: 2 of 11,001 events" in said[0]
+
+
+def test_what_is_right_comes_before_the_error_that_ends_the_reading():
+    """Although a chunk waits for the next one."""
+    found = checked([many(0), many(5000, count=500), many(0)], Path("a"), 18, 24)
+    assert [len(next(found)), len(next(found))] == [2000, 500]
+    with pytest.raises(RecordingError, match="event 2501: time runs backwards, from 5499 to 0"):
+        next(found)
+
+
+def test_as_few_as_possible_are_left_out_across_chunks():
+    """Of two chunks, the end of the first or the beginning of the second."""
+    late = [many(0, then=[9000]), many(2000, then=[9000, 9001]), many(4000), many(6000)]
+    found, said = passed(late, strict=False)
+    assert [t for part in found for t, _ in part] == list(range(8000))
+    assert len(said) == 1 and "left out: 3 of 8,003 events" in said[0]
+    early = [many(0), many(2000), many(1998, count=1, then=range(4000, 6000))]
+    found, said = passed(early, strict=False)
+    assert [t for part in found for t, _ in part] == [*range(4000), *range(4000, 6000)]

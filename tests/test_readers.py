@@ -1532,6 +1532,25 @@ def test_more_than_one_in_a_thousand_is_an_error_wherever_it_comes(tmp_path):
         events_of(recording(0, 1500, 2998, 2999), None)
 
 
+@pytest.mark.parametrize(
+    "wrong", [[0], [0, 1], [1], [99_999], [99_998, 99_999], [100_000], [99_999, 199_999], [299_999]]
+)
+def test_broken_times_are_left_out_wherever_they_are(tmp_path, monkeypatch, caplog, wrong):
+    """Also where no earlier time tells: at the beginning, and at the end of what is read at once.
+    The last time of all could be right, and stays."""
+    monkeypatch.setattr(readers, "CHUNK", 100_000)
+    rows = np.zeros(300_000, [("t", "i8"), ("x", "u2"), ("y", "u2"), ("p", "?")])
+    rows["t"] = 10 * np.arange(len(rows))
+    rows["t"][wrong] = 10**9 + np.arange(len(wrong))
+    np.save(tmp_path / "a.npy", rows)
+    found = events_of(tmp_path / "a.npy")
+    last = wrong == [299_999]
+    np.testing.assert_array_equal(found.t, rows["t"] if last else np.delete(rows["t"], wrong))
+    if not last:
+        assert f"left out: {len(wrong)} of 300,000 events (--strict refuses that)" in caplog.text
+        refused(tmp_path / "a.npy", "time runs backwards, from 100000000")
+
+
 # ---------------------------------------------------------------- what a new user meets
 
 
