@@ -63,8 +63,8 @@ def find_hot_pixels(recording: Recording, most: int = 5_000_000) -> np.ndarray:
     """Recording -> (H, W) bool: the hot pixels, found in the first events.
 
     A hot pixel fires alone: at least 10 times as often as the median of its 5x5 neighbourhood, and
-    more often than chance allows (6 standard deviations above the mean of all active pixels; at
-    least 10 events). A moving edge makes neighbouring pixels fire too.
+    more often than chance allows (6 standard deviations above the mean of the other active pixels,
+    which are not hot; at least 10 events). A moving edge makes neighbouring pixels fire too.
     most: number of events to read.
     """
     counts = np.zeros(recording.pixels, np.int64)
@@ -80,11 +80,15 @@ def find_hot_pixels(recording: Recording, most: int = 5_000_000) -> np.ndarray:
 
 def hot_pixels_of(counts: np.ndarray) -> np.ndarray:
     """(H, W) event counts -> (H, W) bool, by the rule of `find_hot_pixels`."""
-    active = counts[counts > 0]
-    if active.size == 0:
-        return np.zeros(counts.shape, bool)
-    alone = counts >= 10 * np.maximum(median_filter(counts, size=5, mode="reflect"), 1)
-    return alone & (counts > active.mean() + 6 * active.std())
+    hot = counts >= 10 * np.maximum(median_filter(counts, size=5, mode="reflect"), 1)
+    while True:  # fewer each time; where few pixels are active the hot ones would set the mean
+        others = counts[(counts > 0) & ~hot]
+        if others.size == 0:
+            return np.zeros(counts.shape, bool)
+        usual = hot & (counts <= others.mean() + 6 * others.std())
+        if not usual.any():
+            return hot
+        hot &= ~usual
 
 
 def read_hot_pixels(path: str | Path, height: int, width: int) -> np.ndarray:

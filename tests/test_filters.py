@@ -95,3 +95,18 @@ def test_a_hot_pixel_is_ten_times_as_busy_as_its_neighbours_and_far_from_the_mea
     quiet = np.zeros((60, 80), int)
     quiet[30, :] = 1
     assert is_hot(quiet, 10) and not is_hot(quiet, 9)
+
+
+def test_hot_pixels_are_found_where_few_others_are_active():
+    """What is usual is not taken from the hot ones, however many of the active pixels these are."""
+    counts = np.zeros((60, 80), int)
+    counts[::5, ::5][:, :15] = 1
+    hot = np.zeros(counts.shape, bool)
+    hot[2::12, 2::9] = True
+    for many in (1000, 10):
+        np.testing.assert_array_equal(filters.hot_pixels_of(np.where(hot, many, counts)), hot)
+    counts[:, 40:] = np.arange(40) * 10  # and some that are alone, but not beyond the usual
+    counts[20, 20] = 300
+    hot[:, 36:] = False
+    np.testing.assert_array_equal(filters.hot_pixels_of(np.where(hot, 2000, counts)), hot)
+    assert not filters.hot_pixels_of(np.where(hot, 1000, 0)).any()  # nothing tells what is usual
