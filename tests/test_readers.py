@@ -531,6 +531,51 @@ def test_hdf5_mvsec(tmp_path):
     check_frames(path, [1_500_000_000_000_000, 1_500_000_000_100_000])
 
 
+def write_mvsec(path: Path, **left) -> Path:
+    with h5py.File(path, "w") as file:
+        file["davis/left/events"] = np.stack([X, Y, T / 1e6, np.where(P, 1, -1)], 1)
+        for name, data in left.items():
+            file[f"davis/left/{name}"] = data
+    return path
+
+
+def test_mvsec_without_pictures(tmp_path):
+    nothing = {"image_raw": np.zeros((0, 3, 4), np.uint8), "image_raw_ts": np.zeros(0)}
+    for left in ({}, nothing):
+        path = write_mvsec(tmp_path / "a.hdf5", **left)
+        check(path)
+        assert open_recording(path, (240, 320)).frames is None
+        assert open_recording(path).inferred
+
+
+def test_wrong_pictures_of_mvsec(tmp_path):
+    path, pictures = tmp_path / "a.hdf5", np.stack([FRAME, FRAME])
+    for image_raw, times, said in (
+        (pictures, [0.1], "image_raw has the shape (2, 3, 4), image_raw_ts (1,): expected pic"),
+        (pictures, [], "image_raw_ts (0,): expected pictures and the time of each"),
+        (pictures, 0.1, "image_raw_ts (): expected"),
+        (7, [0.1], "image_raw has the shape (), image_raw_ts (1,): expected"),
+    ):
+        refused(write_mvsec(path, image_raw=image_raw, image_raw_ts=times), f"{said}")
+    refused(write_mvsec(path, image_raw=pictures), "davis/left/image_raw_ts is missing: expected")
+
+
+def test_pictures_of_hdf5_are_in_the_order_of_their_numbers(tmp_path):
+    """Which some programs write without zeros."""
+    path = write_cnn(tmp_path / "a.h5")
+    with h5py.File(path, "a") as file:
+        del file["images"]
+        for i in range(12):
+            file[f"images/image{i}"] = FRAME + i
+            file[f"images/image{i}"].attrs["timestamp"] = i / 10
+            file[f"flow/flow{i}"] = np.full((2, *FRAME.shape), i, np.float32)
+    frames = open_recording(path).frames
+    np.testing.assert_array_equal(frames.times, 100_000 * np.arange(12))
+    for i in range(12):
+        np.testing.assert_array_equal(frames.read(i), FRAME + i)
+        assert (frames.flow(i) == i).all()
+
+
 def test_hdf5_in_chunks(tmp_path, monkeypatch):
     path = write_cnn(tmp_path / "a.h5")
     monkeypatch.setattr(readers, "CHUNK", 2)
@@ -582,16 +627,18 @@ def test_cnn_with_something_else_under_a_known_name(tmp_path, name, kind):
         file.create_group(name) if kind == "group" else file.create_dataset(name, data=7)
     if (name, kind) == ("images", "group"):
         assert open_recording(path, (240, 320)).frames is None
+    elif (name, kind) == ("images", "number"):
+        refused(path, "images has the shape (), expected a group of pictures")
     else:
         refused(path)
 
 
-@pytest.mark.parametrize("size", ["240x180", [180], [180, np.nan]])
+@pytest.mark.parametrize("size", ["240x180", 180, [180], [180, np.nan]])
 def test_cnn_with_a_strange_sensor_size(tmp_path, size):
     path = write_cnn(tmp_path / "a.h5", size=None)
     with h5py.File(path, "a") as file:
         file.attrs["sensor_resolution"] = size
-    refused(path)
+    refused(path, f"sensor_resolution is {np.array(size)}, expected height and width in pixels")
 
 
 @pytest.mark.parametrize("size", [[-24, 32], [0, 0], [100_000, 100_000]])

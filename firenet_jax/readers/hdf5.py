@@ -14,7 +14,7 @@ anew by every pass over the events and for every frame, and read in slices.
 """
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -59,8 +59,7 @@ def read(path: Path) -> Source:
         frames = _frames(path, file, layout)
         size = file.attrs.get("sensor_resolution")
         if size is not None:
-            height, width = np.ravel(size)[:2]
-            size = int(height), int(width)
+            size = _resolution(path, size)
         elif match := re.fullmatch(r"(\d+)x(\d+)", str(file.attrs.get("geometry", ""))):
             size = int(match[2]), int(match[1])
     if size is None and frames is not None:
@@ -170,21 +169,62 @@ def _events(path: Path, layout: str) -> Iterator[Events | Rows]:
         yield from in_chunks(*_reader(path, file, layout))
 
 
+def _resolution(path: Path, size: Any) -> tuple[int, int]:
+    try:
+        height, width = np.ravel(size)[:2]
+        return int(height), int(width)
+    except (TypeError, ValueError, OverflowError):  # text, one number alone, nan, infinity
+        raise RecordingError(
+            f"{path}: sensor_resolution is {size}, expected height and width in pixels: "
+            "the file is damaged or of another format"
+        ) from None
+
+
 def _frames(path: Path, file: Any, layout: str) -> Frames | None:
     if layout == "MVSEC":
-        if f"{MVSEC}/image_raw" not in file:
-            return None
-        times = file[f"{MVSEC}/image_raw_ts"][:]
-        return Frames(frame_times(path, times), lambda i: _frame(path, f"{MVSEC}/image_raw", i))
-    if layout != "event_cnn_minimal" or not len(file.get("images", ())):
+        return _mvsec_frames(path, file[MVSEC])
+    if layout != "event_cnn_minimal" or "images" not in file:
         return None
-    names = sorted(file["images"])
-    times = np.array([file["images"][name].attrs["timestamp"] for name in names])
+    images = file["images"]
+    if not isinstance(images, h5py.Group):
+        raise RecordingError(
+            f"{path}: images has the shape {images.shape}, expected a group of pictures"
+        )
+    names = in_order(images)
+    if not names:
+        return None
+    times = np.array([images[name].attrs["timestamp"] for name in names])
     return Frames(
         frame_times(path, times),
         lambda i: _frame(path, f"images/{names[i]}", ...),
         lambda i: _flow(path, f"flow/{names[i].replace('image', 'flow')}"),
     )
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Names of pictures -> by the numbers at their ends, which some programs write without zeros:
+    image2 comes before image10."""
+
+    def number(name: str) -> int:
+        return int("0" + name[len(name.rstrip("0123456789")) :])
+
+    return sorted(names, key=lambda name: (number(name), name))
+
+
+def _mvsec_frames(path: Path, left: Any) -> Frames | None:
+    pictures, times = left.get("image_raw"), left.get("image_raw_ts")
+    if pictures is None or pictures.shape[:1] == (0,):
+        return None
+    if times is None:
+        raise RecordingError(
+            f"{path}: {MVSEC}/image_raw_ts is missing: expected the time of each picture"
+        )
+    if pictures.ndim < 3 or times.shape != pictures.shape[:1]:
+        raise RecordingError(
+            f"{path}: {MVSEC}/image_raw has the shape {pictures.shape}, image_raw_ts "
+            f"{times.shape}: expected pictures and the time of each"
+        )
+    return Frames(frame_times(path, times[:]), lambda i: _frame(path, f"{MVSEC}/image_raw", i))
 
 
 def _frame(path: Path, name: str, index) -> np.ndarray:

@@ -28,7 +28,7 @@ import numpy as np
 from firenet_jax.errors import RecordingError, SettingsError, logger
 from firenet_jax.events import BINS, Events, Rows, checked, event_number
 from firenet_jax.readers import CHUNK, frame_times, to_events, to_frame
-from firenet_jax.readers.hdf5 import opened
+from firenet_jax.readers.hdf5 import in_order, opened
 from firenet_jax.simulation.sensor import Simulation
 from firenet_jax.tensors import Packed, pack, voxelise
 from firenet_jax.warp import warp
@@ -158,7 +158,7 @@ def _facts(path: Path) -> Facts:
 def _index(path: Path) -> Index:
     with opened(path) as file:
         images, stamps = file["images"], file["events/ts"]
-        names = list(images)  # sorted by HDF5
+        names = in_order(images)
         times = np.array([images[name].attrs["timestamp"] for name in names])
         if not (np.diff(times) > 0).all():  # in this form NaN fails too
             image = int(np.argmin(np.diff(times) > 0)) + 1
