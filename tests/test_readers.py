@@ -1328,19 +1328,26 @@ def test_triggers_of_evt2(tmp_path):
     assert found.polarity.tolist() == [False, True, False, True, False]
 
 
+@pytest.mark.parametrize("first", [100, 4093 << 12, 4094 << 12, (4095 << 12) + 7])
 @pytest.mark.parametrize("chunk", [1000, 1 << 18])
-def test_triggers_of_evt3(tmp_path, monkeypatch, chunk):
-    """At the times of events, which faery reads, while the clock starts again twice."""
+def test_triggers_of_evt3(tmp_path, monkeypatch, chunk, first):
+    """At the times of events, which faery reads, while the clock starts again twice. Where it does
+    so at once, faery alone would be 16.8 s too early, and give the first events one time."""
     pytest.importorskip("faery")
     monkeypatch.setattr(camera, "CHUNK", chunk)
-    words, last, times = [], -1, list(range(100, 3 << 24, 40_001))
+    words, last, times = [], (first >> 12) - 1, list(range(first, 3 << 24, 40_001))
+    times[1:1] = [first + 2, first + 5]
     for i, t in enumerate(times):
         words += [high(k) for k in range(last + 1, (t >> 12) + 1)]
         last = t >> 12
         words += [low(t & 0xFFF), row(3), single(i % 640), 0xA000 | i % 16 << 8 | i % 3 % 2]
     body = np.array(words, "<u2").tobytes()
     path = write(tmp_path / "a.raw", b"% evt 3.0\n% geometry 640x480\n% end\n" + body)
-    assert events_of(path, None).t.tolist() == times
+    events = events_of(path, None)
+    assert events.t.tolist() == times
+    assert events.x.tolist() == [i % 640 for i in range(len(times))] and (events.y == 3).all()
+    write(tmp_path / "cut.raw", path.read_bytes()[:-1])
+    refused(tmp_path / "cut.raw", "ends within a word", size=None)
     found, order = open_recording(path).triggers(), np.arange(len(times))
     assert found.times.tolist() == times
     assert found.ids.tolist() == (order % 16).tolist()
