@@ -74,6 +74,14 @@ def test_hours_lose_no_precision():
     check(windows, HighPass(cutoff=1e-5))
 
 
+@pytest.mark.parametrize("start", [-300 * 10**6, -301 * HOUR])
+def test_clocks_may_begin_far_below_zero(start):
+    """The state before the first window is of no time."""
+    rng = np.random.default_rng(9)
+    windows = [random_window(rng, 400, start + 50_000 * k) for k in range(3)]
+    check(windows, HighPass(cutoff=5.0))
+
+
 def test_events_outside_the_sensor_change_nothing():
     x, y = [-1, WIDTH, 3, 3, 2], [5, 5, -1, HEIGHT, 2]
     state = check([Window(Events.of(range(5), x, y, [1] * 5), 4)], HighPass())

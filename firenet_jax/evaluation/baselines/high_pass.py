@@ -111,7 +111,8 @@ def advance(
     alpha = 2 * math.pi * settings.cutoff
     per_pixel = partial(jax.ops.segment_sum, num_segments=height * width)
 
-    elapsed = seconds_between(state.time, sums.time)
+    # Below zero only in the first window, whose clock may be anywhere; there is nothing to forget.
+    elapsed = jnp.maximum(seconds_between(state.time, sums.time), 0.0)
     contrast = jnp.where(sums.p, settings.contrast_on, settings.contrast_off)
     gained = contrast * jnp.exp(-alpha * sums.age - settings.kappa * sums.later)
     count = per_pixel(jnp.ones_like(sums.age), sums.pixel).reshape(height, width)
