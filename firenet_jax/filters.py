@@ -100,7 +100,7 @@ def read_hot_pixels(path: str | Path, height: int, width: int) -> np.ndarray:
     hot = np.zeros((height, width), bool)
     check_readable(path, RecordingError)
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is no text"
         raise RecordingError(f"{path}: cannot read this list of hot pixels: {reason}") from error
