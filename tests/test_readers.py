@@ -1657,6 +1657,32 @@ def test_one_file_of_numpy(tmp_path, kind):
     assert open_recording(path).count == len(T)
 
 
+def test_an_npz_may_tell_the_size_of_the_sensor(tmp_path, caplog):
+    """As the sample of the web page does."""
+    path, size = tmp_path / "a.npz", {"width": 400, "height": np.array([300])}
+    for columns in ({"t": T, "x": X, "y": Y, "p": P}, {"events": np.stack([T, X, Y, P], 1)}):
+        np.savez(path, **columns, **size)
+        check(path, size=None)
+        recording = open_recording(path)
+        assert (recording.height, recording.width, recording.inferred) == (300, 400, False)
+        assert open_recording(path, (350, 450)).width == 450
+    np.savez(path, t=T, x=X, y=Y, p=P, width=400)
+    assert open_recording(path).inferred
+    np.savez(path, t=T, x=X, y=Y, p=P, width=400.5, height=300)
+    refused(path, "width is float64 of shape (), expected a number of pixels", size=None)
+    np.savez(path, t=T, x=X, y=Y, p=P, width=300, height=300)
+    refused(path, "event 3: x is 319, outside the sensor of 300x300 pixels", size=None)
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.npz"])
+def test_a_file_of_numpy_without_rows(tmp_path, name):
+    save = np.save if name == "a.npy" else np.savez
+    save(tmp_path / name, np.zeros((0, 4)))
+    assert open_recording(tmp_path / name, (240, 320)).count == 0
+    with pytest.raises(RecordingError, match="holds no events"):
+        open_recording(tmp_path / name)
+
+
 def test_wrong_files_of_numpy(tmp_path):
     path = tmp_path / "a.npy"
     np.save(path, np.zeros((5, 3)))

@@ -9,7 +9,8 @@
     metadata.json   metadata.json               {"sensor_resolution": [H, W]}; may be missing
 
     one file: rows (N, 4) of t, x, y, p; a structured array with fields of these names (or ts, xs,
-    ys, ps and the like); or, of an .npz, four arrays of these names. Times as above; no size.
+    ys, ps and the like); or, of an .npz, four arrays of these names. Times as above; no size, but
+    for numbers `width` and `height` in an .npz, as in the sample of a web page (`firenet export`).
 
 The files are memory-mapped and sliced as the events are asked for; but an .npz is read whole.
 """
@@ -39,6 +40,7 @@ FILES = {
     "event_cnn_minimal": ("t.npy", "xy.npy", "p.npy", "timestamps.npy"),
 }
 
+SIDES = ("height", "width")
 NPZ = 1 << 34  # bytes of all arrays in an .npz, at most
 
 
@@ -58,7 +60,8 @@ def read(path: Path, columns: str | None = None) -> Source:
         return Source(
             f"numpy {path.suffix.lower()}",
             lambda: _rows(path, _of_one_file(path, order)),
-            count=len(t),
+            _sides(path),
+            len(t),
         )
     if columns is not None:
         raise RecordingError(
@@ -106,7 +109,7 @@ def _of_one_file(path: Path, order: str) -> list[np.ndarray]:
             if sum(info.file_size for info in archive.infolist()) > NPZ:
                 raise ValueError(f"claims more than {NPZ >> 30} GB")
         with reading(path, Exception), np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+            arrays = {name: file[name] for name in file.files if name not in SIDES}
         if len(arrays) == 1:
             (array,) = arrays.values()
         else:
@@ -125,6 +128,23 @@ def _of_one_file(path: Path, order: str) -> list[np.ndarray]:
             f"{path}: its columns look like {other}, not t,x,y,p: pass --columns {other}"
         )
     return [array[:, order.index(name)] for name in "txyp"]
+
+
+def _sides(path: Path) -> tuple[int, int] | None:
+    """(height, width) where an .npz names both."""
+    if path.suffix.lower() != ".npz":
+        return None
+    with reading(path, Exception), np.load(path, allow_pickle=False) as file:
+        if not set(SIDES) <= set(file.files):
+            return None
+        sides = {name: file[name] for name in SIDES}
+    for name, side in sides.items():
+        if side.size != 1 or side.dtype.kind not in "iu":
+            raise RecordingError(
+                f"{path}: {name} is {side.dtype} of shape {side.shape}, expected a number of pixels"
+            )
+    height, width = (int(side.item()) for side in sides.values())
+    return height, width
 
 
 def _named(path: Path, arrays: dict[str, np.ndarray]) -> list[np.ndarray]:

@@ -220,6 +220,8 @@ def other_order(columns: np.ndarray) -> str | None:
     """(4, N) numbers -> "x,y,p,t", say, where no other order is possible: one column alone never
     falls, and exceeds coordinates or has fractions; one alone is 0 and 1 (or -1 and 1). None where
     that is unclear, or the order is t, x, y, p."""
+    if not columns.size:
+        return None
     signs = [set(column.tolist()) in ({0, 1}, {-1, 1}) for column in columns]
     times = [
         (np.diff(column) >= 0).all()
