@@ -9,6 +9,7 @@ import gzip
 import importlib.util
 import io
 import itertools
+import re
 import struct
 import sys
 import zipfile
@@ -220,6 +221,24 @@ def test_text_in_the_unit_that_its_names_tell(tmp_path, caplog, name, unit, whol
     path = write(tmp_path / "a.csv", f"{name},x [px],y,p\n" + "\n".join(lines))
     np.testing.assert_array_equal(events_of(path, (240, 320)).t, times)
     assert "read as microseconds" not in caplog.text
+
+
+@pytest.mark.parametrize("block", [64, 1 << 21])
+@pytest.mark.parametrize(
+    "off, on", [("False", "True"), ("false", "true"), ("-1", "+1"), ("0", "+1")]
+)
+@pytest.mark.parametrize("order", ["t x y p", "p,t,x,y", "x, y, p, t", "t\tp\tx\ty"])
+def test_text_with_polarities_of_other_words(tmp_path, monkeypatch, order, off, on, block):
+    monkeypatch.setattr(text, "BLOCK", block)
+    rows = []
+    for t, x, y, p in EVENTS:
+        values = {"t": f"{t / 1e6:.6f}", "x": x, "y": y, "p": on if p else off}
+        rows.append(re.sub("[txyp]", lambda name, values=values: str(values[name[0]]), order))
+    path = write(tmp_path / "a.txt", order + "\n" + "\n".join(rows))
+    check(path)
+    write(path, order + "\n" + "\n".join([*rows, rows[-1].replace(on, "yes")]))
+    expected = "False or True" if on in ("True", "true") else "0 or 1"
+    refused(path, f"line 7: the polarity is yes, expected {expected}")
 
 
 @pytest.mark.parametrize("size", ["0 0", "320 0", "999999 180"])

@@ -1,7 +1,7 @@
 """Text -> Source: one event a line, `t x y p`, in .txt, .csv, .txt.gz, or a .zip with one of them.
 
     240 180                  the sensor's width and height: E2VID and FireNet; none in ECD
-    0.003811000 96 133 0     seconds, column, row, polarity 0 or 1 (or -1 or 1)
+    0.003811000 96 133 0     seconds, column, row, polarity 0 or 1 (or -1 or 1, False or True)
 
 Separators are spaces, tabs or commas. Times are seconds; where none of the first rows has a decimal
 point they are microseconds, and a notice says so. A line of names (`x,y,p,t`, any order, further
@@ -50,6 +50,7 @@ UNITS = {  # microseconds in a unit: its names
     1.0: ("us", "usec", "µs", "μs", "microsecond", "microseconds"),
     1e-3: ("ns", "nsec", "nanosecond", "nanoseconds"),
 }
+LOGICAL = ("False", "FALSE", "false", "True", "TRUE", "true")  # and 0 and 1: pyarrow's
 WORDS = "no one two three four five six seven eight nine ten".split()
 EXPECTED = {
     "t": ("the time", "a number of seconds"),
@@ -148,7 +149,7 @@ def _sniff(path: Path, member: str | None, columns: str | None = None) -> Layout
             continue
         elif size is None and len(words) == 2 and all(map(str.isdecimal, words)):
             size = (int(words[1]), int(words[0]))
-        elif not _is_number(words[0]):
+        elif not (_is_number(words[0]) or names[0] == "p" and words[0] in LOGICAL):
             raise RecordingError(
                 f"{path}, line {number}: {_shown(line)} where numbers, or the names of columns "
                 "t, x, y and p, are expected: it is not a text of events"
@@ -170,6 +171,9 @@ def _sniff(path: Path, member: str | None, columns: str | None = None) -> Layout
         return not any(set(".e") & set(row[index].lower()) for row in rows if index < len(row))
 
     types = {name: pa.int32() if whole(name) else pa.float64() for name in ("x", "y", "p")}
+    polarity = names.index("p")
+    if any(row[polarity] in LOGICAL for row in rows[:1] if polarity < len(row)):
+        types["p"] = pa.bool_()
     fine = unit is None or unit <= 1  # of seconds, a whole number tells nothing of the next
     types["t"] = pa.int64() if rows and whole("t") and fine else pa.float64()
     if types["t"] == pa.int64() and unit is None:
@@ -350,11 +354,16 @@ def _table(block: bytes, layout: Layout) -> pa.Table:
 
 
 def _tidied(block: bytes, separator: str) -> bytes:
-    """Any run of spaces and tabs -> one separator between words, none at the ends of a line."""
+    """Any run of spaces and tabs -> one separator between words, none at the ends of a line; no
+    word begins with a plus, which pyarrow takes for no number."""
     block = block.replace(b"\r\n", b"\n").replace(b"\t", b" ")
     while b"  " in block:
         block = block.replace(b"  ", b" ")
     block = block.replace(b"\n ", b"\n").replace(b" \n", b"\n").strip(b" ")
+    block = block.replace(b", ", b",").replace(b" ,", b",")  # pyarrow trims numbers, not True
+    for before in (b" ", b",", b"\n"):
+        block = block.replace(before + b"+", before)
+    block = block.removeprefix(b"+")
     return block if separator == "," else block.replace(b" ", separator.encode())
 
 
@@ -402,6 +411,8 @@ def _fault(line: str, layout: Layout) -> str:
             what, expected = EXPECTED[name]
             if name == "t" and layout.types["t"] == pa.int64():
                 expected = "whole microseconds, as in the first lines"
+            if name == "p" and layout.types["p"] == pa.bool_():
+                expected = "False or True, as in the first lines"
             return f"{what} is {_shown(word)[1:-1]}, expected {expected}"
     return ""
 
@@ -409,8 +420,10 @@ def _fault(line: str, layout: Layout) -> str:
 def _fits(word: str, kind: pa.DataType) -> bool:
     if kind == pa.float64():
         return _is_number(word)
+    if kind == pa.bool_():
+        return word in (*LOGICAL, "0", "1")
     limit = 2 ** (kind.bit_width - 1)
-    return re.fullmatch(r"-?[0-9]{1,19}", word) is not None and -limit <= int(word) < limit
+    return re.fullmatch(r"[-+]?[0-9]{1,19}", word) is not None and -limit <= int(word) < limit
 
 
 def _count(number: int, noun: str = " words") -> str:
