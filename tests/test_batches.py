@@ -242,6 +242,13 @@ def test_a_window_without_events_and_a_file_without_any(tmp_path):
     assert not data.tensors.any() and data.images.any() and data.visible.any()
 
 
+def test_events_of_another_clock_than_the_images_are_said(tmp_path):
+    later = random_events(0)
+    later = Events(later.t + 10**9, later.x, later.y, later.p)
+    file = write(tmp_path / "a.h5", later, moving_pictures())
+    assert "none of its 4,000 events is between its images" in refused(file)
+
+
 def test_a_further_batch_compiles_nothing(noise):
     _simulation.clear_cache()
     take(noise, 4)

@@ -102,6 +102,34 @@ def test_recordings_that_cannot_be_learnt_from_are_said(tmp_path, folder):
                        coordinator="127.0.0.1:1"))  # fmt: skip
 
 
+def write_pictures(path, times, events, size=24):
+    """An HDF5 sequence of grey pictures at these times, in microseconds."""
+    pictures = [Picture(t, np.full((size, size), k, np.uint8), None) for k, t in enumerate(times)]
+    nothing = [0] * len(events)
+    write_sequence(
+        path, [Events.of(events, nothing, nothing, nothing)], pictures, height=size, width=size
+    )
+    return path
+
+
+@pytest.mark.parametrize(
+    "events, said",
+    [
+        ([900_000, 990_000], "no overlap in time: frames 0.000000 to 0.190000 s, events from 0.9"),
+        ([], "no events: "),
+        # of 20 frames, those from number 17 on, at 160 ms, are held out
+        ([165_000, 170_000], "no events from 0.000000 to 0.160000 s, between the frames to learn"),
+        ([5_000, 70_000], "no events from 0.160000 to 0.190000 s, between the frames held out"),
+    ],
+)
+def test_events_that_share_no_time_with_the_frames_are_said(tmp_path, events, said):
+    times = range(0, 200_000, 10_000)
+    path = write_pictures(tmp_path / "a.h5", times, events)
+    with pytest.raises(RecordingError, match=f"{path}: {said}"):
+        train.run(tiny(tmp_path / "run", data=(path,), crop=16))
+    assert not list((tmp_path / "run").rglob("*.h5"))
+
+
 def test_a_run_keeps_to_its_recordings(tmp_path, folder):
     other = write_folder(tmp_path / "other", seed=1)
     settings = tiny(tmp_path / "run", data=(folder,))

@@ -22,7 +22,9 @@ import numpy as np
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.errors import RecordingError, SettingsError, logger
 from firenet_jax.evaluation import metrics
+from firenet_jax.evaluation.comparison import Gap
 from firenet_jax.evaluation.equalise import equalise
+from firenet_jax.evaluation.protocol import first_event
 from firenet_jax.events import Events, Frames, Recording
 from firenet_jax.network import Weights, initial_state
 from firenet_jax.readers import open_recording
@@ -74,7 +76,8 @@ def run(settings: Train) -> None:
 def cut_off(path: Path, windows: int) -> Cut:
     """A recording, of which the last fifth is held out, or as many windows as a step has.
 
-    Raises RecordingError where it has no frames, or too few of them for both parts.
+    Raises RecordingError where it has no frames, too few of them for both parts, or no events in
+    their time.
     """
     recording = open_recording(path)
     frames = recording.frames
@@ -97,6 +100,12 @@ def cut_off(path: Path, windows: int) -> Cut:
             f"{path}: has {count + 1} frames, but {2 * windows + 2} are needed to learn from "
             f"{windows} windows in a row and to hold out as many: ask for fewer --windows"
         )
+    try:
+        first_event(recording, frames.times)
+    except Gap as gap:
+        raise RecordingError(
+            f"{path}: {gap}: use a recording whose frames are on the clock of its events"
+        ) from gap
     return Cut(recording, frames, count - held)
 
 
@@ -112,7 +121,8 @@ def _check_times(path: Path, times: np.ndarray) -> None:
 def write_sequences(cuts: list[Cut], settings: Train) -> None:
     """The files of `settings.sequences`, those that are not there yet.
 
-    Raises OutputError where the folder holds others.
+    Raises OutputError where the folder holds others, RecordingError for a recording that turns out
+    to be of no use; that leaves no files, which would be in the way of other recordings.
     """
     folder = settings.sequences
     held = [len(one.frames.times) - 1 - one.end for one in cuts]
@@ -124,25 +134,40 @@ def write_sequences(cuts: list[Cut], settings: Train) -> None:
             runs.check_same(found, record, f"{folder} holds sequences of others", way_out)
         write_text(folder / "settings.json", runs.as_text(record))
         runs.make_folder(folder / "validation")
-        for number, one in enumerate(cuts):
-            # recordings of different folders may have one name
-            name = f"{number:03d}_{one.recording.path.stem}.h5"
-            parts = {folder / name: (0, one.end), folder / "validation" / name: (one.end, None)}
-            for path, (first, last) in parts.items():
+        parts = _parts(cuts, folder)
+        try:
+            for path, part in parts.items():
                 if not path.exists():
-                    _write(path, one, first, last)
+                    _write(path, *part)
+        except RecordingError:
+            for path in (*parts, folder / "settings.json"):
+                path.unlink(missing_ok=True)
+            raise
+
+
+def _parts(cuts: list[Cut], folder: Path) -> dict[Path, tuple[Cut, int, int | None]]:
+    """File: what `_write` writes into it."""
+    found = {}
+    for number, one in enumerate(cuts):
+        # recordings of different folders may have one name
+        name = f"{number:03d}_{one.recording.path.stem}.h5"
+        found[folder / name] = one, 0, one.end
+        found[folder / "validation" / name] = one, one.end, None
+    return found
 
 
 def _write(path: Path, one: Cut, first: int, last: int | None) -> None:
     """The frames first to last, the last one included, and the events between them; times count
-    from the first of them, for as seconds since 1970 they would not be whole microseconds."""
+    from the first of them, for as seconds since 1970 they would not be whole microseconds.
+
+    Raises RecordingError where there are no events between them."""
     numbers = range(len(one.frames.times))[first : None if last is None else last + 1]
     zero, until = (int(one.frames.times[number]) for number in (numbers[0], numbers[-1]))
     flow = one.frames.flow or (lambda number: None)
     pictures = (
         Picture(int(one.frames.times[n]) - zero, one.frames.read(n), flow(n)) for n in numbers
     )
-    write_sequence(
+    count = write_sequence(
         path,
         _between(one.recording, zero, until),
         pictures,
@@ -150,6 +175,12 @@ def _write(path: Path, one: Cut, first: int, last: int | None) -> None:
         width=one.recording.width,
         settings={"recording": str(one.recording.path), "zero": zero},
     )
+    if not count:
+        what = "held out" if last is None else "to learn from"
+        raise RecordingError(
+            f"{one.recording.path}: no events from {zero / 1e6:.6f} to {until / 1e6:.6f} s, "
+            f"between the frames {what}: use a recording with events in both parts"
+        )
 
 
 def _between(recording: Recording, start: int, stop: int) -> Iterator[Events]:

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.errors import RecordingError, SettingsError, logger
-from firenet_jax.events import BINS, Events, Rows, checked, event_number
+from firenet_jax.events import BINS, Events, Rows, checked, counted, event_number
 from firenet_jax.readers import CHUNK, frame_times, to_events, to_frame
 from firenet_jax.readers.hdf5 import in_order, opened
 from firenet_jax.simulation.sensor import Simulation
@@ -170,6 +170,12 @@ def _index(path: Path) -> Index:
         # Not the attribute event_idx: programs differ in what it counts, by one.
         for events in checked(_stamps(path, stamps), path, None, None):
             rows += np.searchsorted(events.t, times)
+        if len(stamps) and rows[0] == rows[-1]:  # a file without any events is of a still camera
+            raise RecordingError(
+                f"{path}: none of its {counted(len(stamps), 'event')} is between its images, from "
+                f"{times[0] / 1e6:.6f} to {times[-1] / 1e6:.6f} s: they are not on one clock; take "
+                "the file out of the folder"
+            )
     return Index(names, times, rows)
 
 
