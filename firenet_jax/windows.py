@@ -210,8 +210,12 @@ def _by_count_or_time(chunks: Iterator[Events], count: int, longest: int) -> Ite
 def _by_time(path, chunks: Iterator[Events], begin: int | None, spans) -> Iterator[Window]:
     """Windows of the events with start <= t < stop, for each span of `spans(begin)`.
 
-    Ends with the first window that reaches the recording's last event.
+    Ends with the first window that reaches the recording's last event. Events before `begin` are
+    dropped as they come: they may be most of a recording.
     """
+    if begin is not None:
+        later = (chunk.select(slice(np.searchsorted(chunk.t, begin), None)) for chunk in chunks)
+        chunks = filter(len, later)
     first = next(chunks, None)
     if first is None:
         return

@@ -1,4 +1,6 @@
 import itertools
+import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +107,26 @@ def test_windows_in_time_from_where_one_says():
     assert [(w.time, len(w.events)) for w in windows] == [(20, 0), (25, 1), (40, 0), (41, 1)]
     windows = list(cut(recording, Windows(duration=0.01), begin=20))
     assert [(w.time, len(w.events)) for w in windows] == [(25, 1), (40, 0), (41, 1)]
+
+
+@pytest.mark.parametrize("windows", [{"duration": 10}, {"between_frames": True}])
+def test_events_before_the_first_window_are_not_held(windows):
+    """A thousand chunks of 13 kB lie before it, one after it."""
+
+    def chunks():
+        for t in range(0, 1_001_000, 1000):
+            yield Events.of(np.arange(t, t + 1000), *np.zeros((3, 1000), np.int16))
+
+    recording = replace(recording_of([], frames=range(0, 1_001_000, 10_000)), events=chunks)
+    tracemalloc.start()
+    try:
+        found = list(cut(recording, Windows(**windows), begin=1_000_000))
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert [(window.time, len(window.events)) for window in found] == [(1_000_999, 1000)]
+    assert most < 1e6
+    assert not list(cut(recording, Windows(**windows), begin=1_001_000))
 
 
 @pytest.mark.parametrize("windows", [{"duration": 10}, {"between_frames": True}])
