@@ -130,6 +130,27 @@ def test_events_that_share_no_time_with_the_frames_are_said(tmp_path, events, sa
     assert not list((tmp_path / "run").rglob("*.h5"))
 
 
+@pytest.mark.parametrize("number", [0, 7, 19])
+def test_a_frame_of_another_size_is_said(tmp_path, number):
+    from PIL import Image
+
+    path = write_folder(tmp_path / "a")
+    image = path / f"images/frame_{number:08d}.png"
+    with Image.open(image) as picture:
+        smaller = picture.resize((SIZE - 1, SIZE - 2))
+    smaller.save(image)
+    (path / "events.txt").write_text(f"{SIZE} {SIZE}\n" + (path / "events.txt").read_text())
+    said = f"{path}, frame {number + 1}: has 39x38 pixels, the sensor 40x40, expected the same"
+    with pytest.raises(RecordingError, match=said):
+        train.run(tiny(tmp_path / "run", data=(path,)))
+    assert not list((tmp_path / "run").rglob("*.h5"))
+    if number:  # the first is not judged, as no window ends there
+        recording = open_recording(path)
+        one = train.Cut(recording, recording.frames, number - 1)
+        with pytest.raises(RecordingError, match=said):
+            train.judged(Weights(initial_params(jax.random.key(0)), True), one, near=False)
+
+
 def test_a_run_keeps_to_its_recordings(tmp_path, folder):
     other = write_folder(tmp_path / "other", seed=1)
     settings = tiny(tmp_path / "run", data=(folder,))

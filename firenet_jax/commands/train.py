@@ -52,6 +52,16 @@ class Cut(NamedTuple):
     frames: Frames
     end: int  # the frame with which the held-out end begins; the first that is judged is the next
 
+    def frame(self, number: int) -> np.ndarray:
+        """(H, W) uint8. Raises RecordingError where its size is not that of the sensor."""
+        found, height, width = self.frames.read(number), self.recording.height, self.recording.width
+        if found.shape != (height, width):
+            raise RecordingError(
+                f"{self.recording.path}, frame {number + 1}: has {found.shape[1]}x{found.shape[0]} "
+                f"pixels, the sensor {width}x{height}, expected the same"
+            )
+        return found
+
 
 def run(settings: Train) -> None:
     """Trains as the settings say; on recordings, says how well it did on their ends.
@@ -87,12 +97,6 @@ def cut_off(path: Path, windows: int) -> Cut:
             "pictures beside the events, or a folder of HDF5 sequences"
         )
     _check_times(path, frames.times)
-    size = frames.read(0).shape
-    if size != (recording.height, recording.width):
-        raise RecordingError(
-            f"{path}: its frames have {size[1]}x{size[0]} pixels, its sensor "
-            f"{recording.width}x{recording.height}, expected the same"
-        )
     count = len(frames.times) - 1
     held = max(count // HELD_OUT_SHARE, windows)
     if count - held < windows + 1:  # a start is drawn from one place or more
@@ -106,7 +110,9 @@ def cut_off(path: Path, windows: int) -> Cut:
         raise RecordingError(
             f"{path}: {gap}: use a recording whose frames are on the clock of its events"
         ) from gap
-    return Cut(recording, frames, count - held)
+    found = Cut(recording, frames, count - held)
+    found.frame(0)  # of another size than the sensor, most often all are
+    return found
 
 
 def _check_times(path: Path, times: np.ndarray) -> None:
@@ -164,9 +170,7 @@ def _write(path: Path, one: Cut, first: int, last: int | None) -> None:
     numbers = range(len(one.frames.times))[first : None if last is None else last + 1]
     zero, until = (int(one.frames.times[number]) for number in (numbers[0], numbers[-1]))
     flow = one.frames.flow or (lambda number: None)
-    pictures = (
-        Picture(int(one.frames.times[n]) - zero, one.frames.read(n), flow(n)) for n in numbers
-    )
+    pictures = (Picture(int(one.frames.times[n]) - zero, one.frame(n), flow(n)) for n in numbers)
     count = write_sequence(
         path,
         _between(one.recording, zero, until),
@@ -246,7 +250,7 @@ def judged(weights: Weights, one: Cut, near: bool) -> Score:
         seen = near_now[-1:]
         counted = [k for k, (number, _) in enumerate(group) if number > one.end]
         if counted:
-            truths = np.stack([one.frames.read(group[k][0]) for k in counted]) / np.float32(255)
+            truths = np.stack([one.frame(group[k][0]) for k in counted]) / np.float32(255)
             there = near_now[np.array(counted), 0] if near else np.ones(truths.shape, bool)
             chosen = np.clip(images[np.array(counted), 0], 0, 1)
             pairs = (chosen, truths), (equalise(chosen, "global"), equalise(truths, "global"))
