@@ -15,7 +15,9 @@ from test_cli import firenet
 from test_pipeline import write_recording
 
 from firenet_jax.commands.export import Export, run, simulated
+from firenet_jax.events import Events
 from firenet_jax.export.web_page import FILES
+from firenet_jax.storage.sequence_file import Picture, write_sequence
 
 # Reconstructs each recording, sends its pictures here; then what the page itself says.
 TEST_PAGE = """<!doctype html><iframe id="page" src="index.html"></iframe><script type="module">
@@ -112,7 +114,9 @@ def test_a_page_without_its_runtime_says_what_to_install(tmp_path, capsys, monke
     assert code == 1 and f"1.2.3, which lacks {FILES[0]}" in error
 
 
-def test_a_page_holds_all_that_it_asks_for(tmp_path, capsys, monkeypatch):
+@pytest.fixture
+def runtime(tmp_path, monkeypatch):
+    """A working folder with the files of a runtime, which are empty, and a recording a.txt."""
     pytest.importorskip("onnx")
     monkeypatch.chdir(tmp_path)
     runtime = tmp_path / "node_modules" / "onnxruntime-web"
@@ -121,6 +125,10 @@ def test_a_page_holds_all_that_it_asks_for(tmp_path, capsys, monkeypatch):
     for name in FILES:
         (runtime / "dist" / name).write_text("")
     write_recording(tmp_path / "a.txt", 900)
+    return runtime
+
+
+def test_a_page_holds_all_that_it_asks_for(tmp_path, capsys, runtime):
     code, said, error = firenet(capsys, "export --web page --sample a.txt")
     assert code == 0 and "a sample of 900 events" in said, error
     for script in ("page.js", "network.js", "events.js", "index.html"):
@@ -129,6 +137,31 @@ def test_a_page_holds_all_that_it_asks_for(tmp_path, capsys, monkeypatch):
         assert len(sample["t"]) == 900 and (sample["width"], sample["height"]) == (24, 20)
     assert firenet(capsys, "export --web page --sample a.txt")[0] == 1
     assert firenet(capsys, "export --web page --sample a.txt --overwrite")[0] == 0
+
+
+def test_a_page_in_the_folder_that_one_is_in(tmp_path, capsys, monkeypatch, runtime):
+    (tmp_path / "site").mkdir()
+    monkeypatch.chdir(tmp_path / "site")
+    line = f"export --web . --sample ../a.txt --runtime {runtime}"
+    code, said, error = firenet(capsys, line)
+    assert code == 0 and said.startswith(".: a page"), error
+    assert (tmp_path / "site" / "index.html").is_file() and not list(tmp_path.glob("*.partial"))
+    code, _, error = firenet(capsys, line)
+    assert code == 1 and "exists" in error
+
+
+def test_a_page_that_cannot_be_is_one_sentence(tmp_path, capsys, runtime):
+    events, pictures = Events.empty(), [Picture(0, np.zeros((8, 8), np.uint8), None)]
+    write_sequence(tmp_path / "silent.h5", [events], pictures, height=8, width=8)
+    for line, said in [
+        ("export --web page --sample silent.h5", "silent.h5: holds no events"),
+        ("export --web a.txt", "a.txt is a file"),
+        ("export --web a.txt --overwrite", "a.txt is a file"),
+    ]:
+        before = sorted(tmp_path.iterdir())
+        code, _, error = firenet(capsys, line)
+        assert code == 1 and said in error and error.count("\n") == 1, error
+        assert sorted(tmp_path.iterdir()) == before
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import tyro
 
 from firenet_jax.checkpoint import BUILT_IN, load_weights
 from firenet_jax.commands.demo import Demo, make_scene
+from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, concatenate
 from firenet_jax.export.onnx_model import onnx_model
 from firenet_jax.export.stablehlo import stablehlo
@@ -72,6 +73,8 @@ def run(settings: Export) -> None:
 
 
 def write_web(folder: Path, settings: Export) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder} is a file: choose another name for the folder")
     if folder.exists() and not settings.overwrite and any(folder.iterdir()):
         raise OutputError(f"{folder} exists; choose another name or pass --overwrite")
     version = runtime_version(settings.runtime)
@@ -87,6 +90,10 @@ def write_web(folder: Path, settings: Export) -> None:
         size += len(held[-1])
         if size >= SAMPLE:
             break
+    if not size:
+        raise RecordingError(
+            f"{settings.sample}: holds no events: choose another --sample, or leave it out"
+        )
     write_page(folder, weights, concatenate(held), height, width, settings.runtime)
     print(
         f"{folder}: a page with onnxruntime-web {version} and a sample of {size:,} events; "

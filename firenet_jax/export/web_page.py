@@ -19,7 +19,7 @@ import numpy as np
 from firenet_jax.events import Events
 from firenet_jax.export.onnx_model import onnx_model
 from firenet_jax.network import Weights
-from firenet_jax.storage.files import OutputError, partial_name, writing
+from firenet_jax.storage.files import OutputError, named, partial_name, writing
 
 RUNTIME = "onnxruntime-web"
 # Both ways to run: on a GPU, and where there is none.
@@ -54,7 +54,7 @@ def write_page(folder: Path, weights: Weights, sample: Events, height: int, widt
     """Writes the folder. Raises OutputError where onnx or the runtime is missing, or no room."""
     runtime_version(runtime)
     model = onnx_model(weights, picture=True).SerializeToString()
-    beside = partial_name(folder)
+    beside = partial_name(named(folder))
     with writing(folder):
         shutil.rmtree(beside, ignore_errors=True)
         (beside / "ort").mkdir(parents=True)
