@@ -7,17 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_train import entries, tiny
+from test_train import begun, entries, tiny
 
 import firenet_jax as fj
 from firenet_jax import cli
+from firenet_jax.checkpoint import save_weights
 from firenet_jax.commands import train
-from firenet_jax.errors import OutputError, RecordingError, SettingsError
+from firenet_jax.errors import FirenetError, OutputError, RecordingError, SettingsError
 from firenet_jax.evaluation import metrics
 from firenet_jax.events import Events, concatenate
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.readers import open_recording
 from firenet_jax.simulation.sensor import Simulation
+from firenet_jax.storage.files import locked
 from firenet_jax.storage.sequence_file import Picture, write_sequence
 from firenet_jax.training.settings import Train
 from firenet_jax.training.step import loss_of, near_events
@@ -162,6 +164,38 @@ def test_a_run_keeps_to_its_recordings(tmp_path, folder):
         changed = dataclasses.replace(settings, data=data)
         with pytest.raises(OutputError, match="holds sequences of others"):
             train.write_sequences([train.cut_off(path, windows) for path in data], changed)
+
+
+@pytest.mark.parametrize(
+    "choices, said",
+    [
+        ({"crop": SIZE + 1}, "noise: its frames have 40x40 pixels, fewer than the crop of 41x41"),
+        ({"chain": 6}, "noise: has 17 frames to learn from, .* 18 windows in a row need 19"),
+        ({"weights": "plus.npz"}, "plus.npz expects tensors that are not normalised"),
+        ({"weights": "missing.npz"}, "missing.npz"),
+        ({"batch": 3}, "dealt out to 2 devices"),
+    ],
+)
+def test_a_start_that_is_refused_writes_no_sequences(tmp_path, folder, monkeypatch, choices, said):
+    monkeypatch.chdir(tmp_path)
+    if "batch" in choices:
+        monkeypatch.setattr(jax, "device_count", lambda: 2)
+    save_weights("plus.npz", Weights(initial_params(jax.random.key(0)), normalise=False))
+    settings = tiny(tmp_path / "run", data=(folder,), **choices)
+    with pytest.raises(FirenetError, match=said):
+        train.run(settings)
+    assert not settings.sequences.exists()
+
+
+def test_no_sequences_are_written_into_the_folder_of_another_run(tmp_path, folder):
+    begun(tmp_path / "run", tiny(tmp_path / "run"))
+    settings = tiny(tmp_path / "run", data=(folder,))
+    with pytest.raises(OutputError, match="holds a run with other settings"):
+        train.run(settings)
+    with locked(tmp_path / "run"), pytest.raises(OutputError, match="another run is writing it"):
+        (tmp_path / "run/settings.json").unlink()
+        train.run(settings)
+    assert not settings.sequences.exists()
 
 
 def test_a_folder_of_sequences_is_no_recording(tmp_path, folder):

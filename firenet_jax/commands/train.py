@@ -25,7 +25,7 @@ from firenet_jax.evaluation import metrics
 from firenet_jax.evaluation.comparison import Gap
 from firenet_jax.evaluation.equalise import equalise
 from firenet_jax.evaluation.protocol import first_event
-from firenet_jax.events import Events, Frames, Recording
+from firenet_jax.events import Events, Frames, Recording, counted
 from firenet_jax.network import Weights, initial_state
 from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import reconstruct
@@ -74,10 +74,11 @@ def run(settings: Train) -> None:
                 f"name {settings.sequences} as --data"
             )
         cuts = [cut_off(path, settings.windows) for path in settings.data]
-        write_sequences(cuts, settings)
-    training.run(settings)
-    if settings.on_recordings:
+        check_fit(cuts, settings)
+        training.run(settings, prepare=lambda: write_sequences(cuts, settings))
         tell(cuts, settings)
+    else:
+        training.run(settings)
 
 
 # ---- Recordings -> sequences
@@ -121,6 +122,24 @@ def _check_times(path: Path, times: np.ndarray) -> None:
         raise RecordingError(
             f"{path}, frame {frame + 1}: its time is {times[frame]} us, not after "
             f"{times[frame - 1]} us, that of the frame before: the file is damaged"
+        )
+
+
+def check_fit(cuts: list[Cut], settings: Train) -> None:
+    """Raises RecordingError where `training.batches` would, of what is not written yet."""
+    for one in cuts:
+        height, width = one.recording.height, one.recording.width
+        if min(height, width) < settings.crop:
+            raise RecordingError(
+                f"{one.recording.path}: its frames have {width}x{height} pixels, fewer than the "
+                f"crop of {settings.crop}x{settings.crop}: choose a smaller --crop"
+            )
+    longest, total = max(cuts, key=lambda one: one.end), settings.chain * settings.windows
+    if longest.end < total:
+        raise RecordingError(
+            f"{longest.recording.path}: has {longest.end + 1} frames to learn from, the most of "
+            f"{counted(len(cuts), 'recording')}, but {total} windows in a row need {total + 1}: "
+            "ask for fewer --windows or a shorter --chain"
         )
 
 

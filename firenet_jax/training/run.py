@@ -52,10 +52,13 @@ VALIDATION = 8  # batches
 UNRECORDED = "log_every", "save_every", "validate_every"  # do not affect what is computed
 
 
-def run(settings: Train, stop: int | None = None) -> None:
+def run(
+    settings: Train, stop: int | None = None, prepare: Callable[[], None] = lambda: None
+) -> None:
     """Trains as the settings say, or resumes an interrupted run.
 
-    stop: end after this many steps, in the middle of the schedule.
+    stop: end after this many steps, in the middle of the schedule. prepare: makes the data; called
+    when devices, weights and folder are known to be right, so that a refused start makes none.
     Raises a FirenetError if the settings do not match the folder, the weights or the devices, or if
     another run writes into the folder.
     """
@@ -76,6 +79,7 @@ def run(settings: Train, stop: int | None = None) -> None:
         if saved.latest_step() is not None:
             state = restored(saved, state)
             logger.warning("%s: going on after step %d", folder, state.step)
+        prepare()
         done = int(state.step)
         sources, validation = sources_of(settings, done)
         _keep_settings(folder, settings)  # only now, so that a failed start leaves no run behind
