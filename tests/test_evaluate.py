@@ -645,6 +645,17 @@ def test_impossible_settings(folder, tmp_path, choice, message):
 def test_e2vid_runs_as_in_evreal(sigmoid):
     """E2VID: normalised tensors, 1st and 99th percentile to 0 and 1; E2VID+: neither."""
     small = e2vid.Settings(sigmoid=sigmoid, channels=4)
+def test_runs_are_named_by_all_of_their_folders_names(tmp_path):
+    """A learning rate is no suffix."""
+    weights = Weights(initial_params(jax.random.key(0)), True)
+    for name in ("lr0.001", "lr0.01"):
+        (tmp_path / name).mkdir()
+        save_weights(tmp_path / name / "weights.npz", weights)
+    save_weights(tmp_path / "lr0.1.npz", weights)
+    paths = [tmp_path / name for name in ("lr0.001", "lr0.01", "lr0.1.npz")]
+    assert [method.name for method in load(["firenet"], paths)] == ["lr0.001", "lr0.01", "lr0.1"]
+
+
     params = e2vid.initial_params(jax.random.key(0), small)
     window = Window(events_of(500, 1000), 1000)
     method = recurrent_unet("e2vid", params, small)

@@ -70,9 +70,9 @@ def load(
 ) -> list[Method | Missing]:
     """The methods of these names, in their order.
 
-    weights: files of FireNet or FireNet+, each a method named by its stem; without any, those of
-    the package. e2vid_random: where no file is named, random weights: for measuring time.
-    e2vid_sigmoid: False for E2VID+. A method without weights is `Missing`.
+    weights: files of FireNet or FireNet+, or folders of runs, each a method of its name; without
+    any, those of the package. e2vid_random: where no file is named, random weights: for measuring
+    time. e2vid_sigmoid: False for E2VID+. A method without weights is `Missing`.
     Raises SettingsError for unknown and repeated names and for weights of methods that are not
     named, CheckpointError for files that cannot be read.
     """
@@ -84,7 +84,7 @@ def load(
         if name not in METHODS:
             raise SettingsError(f"no method {name!r}: choose from {', '.join(METHODS)}")
         if name == "firenet" and weights:
-            found += [firenet(named(path).stem, load_weights(path)) for path in weights]
+            found += [firenet(_title(path), load_weights(path)) for path in weights]
         elif name == "firenet":
             found.append(firenet(name, load_weights()))
         elif name == "e2vid" and e2vid_weights is not None:
@@ -106,6 +106,11 @@ def load(
             f"two methods are named {twice}: rename a file of weights, or name it once"
         )
     return found
+
+
+def _title(path: Path) -> str:
+    """A file's name without its suffix; all of a folder's, for `lr0.001` has none."""
+    return named(path).name if path.is_dir() else path.stem
 
 
 def firenet(name: str, weights: Weights) -> Method:
