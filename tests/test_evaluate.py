@@ -3,9 +3,11 @@
 import csv
 import datetime
 import html
+import importlib
 import json
 import re
 import shlex
+import zipfile
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -571,6 +573,48 @@ def test_gaps_have_names_and_the_rest_is_measured(folder, tmp_path, capsys):
     assert results["means"]["over sequences"]["e2vid"] == {"gap": "no weights"}
 
 
+def test_a_file_in_a_folder_that_cannot_be_opened_is_a_gap(folder, tmp_path, capsys, caplog):
+    data = tmp_path / "data"
+    write(data / "good.h5", 6)
+    with zipfile.ZipFile(data / "photographs.zip", "w") as archive:
+        archive.writestr("a.jpg", b"")
+    (data / "half.h5").write_bytes((data / "good.h5").read_bytes()[:3000])
+    for _ in range(2):  # anew, and going on
+        results = run(settings(folder, tmp_path / "out", data=(data,), methods="hf"))
+        found = {name: entry["methods"]["hf"] for name, entry in results["sequences"].items()}
+        assert found["data-good"]["frames"] == 5
+        assert found["data-photographs"]["gap"].startswith(f"{data / 'photographs.zip'}: ")
+        assert "cannot be read" in found["data-half"]["gap"]
+        assert f"{data / 'half.h5'}: cannot be read" in caplog.text
+        assert "data-photographs" in capsys.readouterr().out
+        assert "<p>not opened</p>" in (tmp_path / "out/index.html").read_text()
+    with pytest.raises(RecordingError, match=r"half\.h5: cannot be read"):
+        run(settings(folder, tmp_path / "named", data=(data / "half.h5",), methods="hf"))
+    (data / "good.h5").unlink()
+    with pytest.raises(RecordingError, match="nothing can be evaluated: data-half / hf: "):
+        run(settings(folder, tmp_path / "none", data=(data,), methods="hf"))
+
+
+def test_folders_are_searched_for_all_formats_that_can_hold_frames(tmp_path):
+    """The readers say what they take; formats of events alone would only make gaps."""
+    modules = [
+        importlib.import_module(f"firenet_jax.readers.{name}")
+        for name in ("rosbag", "hdf5", "aedat4", "aedat3", "aedat2")
+    ]
+    text = (Path(firenet_jax.__file__).parents[1] / "docs/formats.md").read_text()
+    suffixes = {*re.findall(r"`(\.[a-z0-9]+)`", text), ".aedat2", ".aedat3", ".hdf5", ".hdf"}
+    for suffix in sorted(suffixes):
+        (tmp_path / f"a{suffix}").touch()
+        (tmp_path / f"b{suffix.upper()}").touch()
+    expected = [
+        path
+        for path in sorted(tmp_path.iterdir())
+        if path.suffix.lower() == ".zip" or any(module.matches(path) for module in modules)
+    ]
+    assert len(expected) == 2 * len({path.suffix.lower() for path in expected}) >= 22
+    assert evaluate.recordings_in(tmp_path) == expected
+
+
 def test_pixels_whose_flow_is_not_known_do_not_count(folder, tmp_path):
     """They may be anything, nan too; the others keep their weight in a mean over all pixels."""
     for name in ("whole", "part"):
@@ -599,6 +643,17 @@ def test_frames_of_another_size_and_nothing_at_all(folder, tmp_path):
     twice = (folder / "data" / "a.h5", folder / "data" / "a.h5")
     with pytest.raises(ValueError, match="both named a"):
         run(settings(folder, tmp_path / "out", data=twice))
+
+
+def test_runs_are_named_by_all_of_their_folders_names(tmp_path):
+    """A learning rate is no suffix."""
+    weights = Weights(initial_params(jax.random.key(0)), True)
+    for name in ("lr0.001", "lr0.01"):
+        (tmp_path / name).mkdir()
+        save_weights(tmp_path / name / "weights.npz", weights)
+    save_weights(tmp_path / "lr0.1.npz", weights)
+    paths = [tmp_path / name for name in ("lr0.001", "lr0.01", "lr0.1.npz")]
+    assert [method.name for method in load(["firenet"], paths)] == ["lr0.001", "lr0.01", "lr0.1"]
 
 
 def test_weights_that_are_not_there_or_not_finite(folder, tmp_path):
@@ -645,17 +700,6 @@ def test_impossible_settings(folder, tmp_path, choice, message):
 def test_e2vid_runs_as_in_evreal(sigmoid):
     """E2VID: normalised tensors, 1st and 99th percentile to 0 and 1; E2VID+: neither."""
     small = e2vid.Settings(sigmoid=sigmoid, channels=4)
-def test_runs_are_named_by_all_of_their_folders_names(tmp_path):
-    """A learning rate is no suffix."""
-    weights = Weights(initial_params(jax.random.key(0)), True)
-    for name in ("lr0.001", "lr0.01"):
-        (tmp_path / name).mkdir()
-        save_weights(tmp_path / name / "weights.npz", weights)
-    save_weights(tmp_path / "lr0.1.npz", weights)
-    paths = [tmp_path / name for name in ("lr0.001", "lr0.01", "lr0.1.npz")]
-    assert [method.name for method in load(["firenet"], paths)] == ["lr0.001", "lr0.01", "lr0.1"]
-
-
     params = e2vid.initial_params(jax.random.key(0), small)
     window = Window(events_of(500, 1000), 1000)
     method = recurrent_unet("e2vid", params, small)

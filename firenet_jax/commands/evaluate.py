@@ -19,7 +19,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import tyro
@@ -34,7 +34,7 @@ from firenet_jax.evaluation.methods import METHODS, Method, Missing, digest, loa
 from firenet_jax.evaluation.protocol import Protocol, evaluate, plan, steps_of
 from firenet_jax.evaluation.results import METRICS, Measured, mean, summary
 from firenet_jax.events import Recording
-from firenet_jax.readers import FORMATS, open_recording
+from firenet_jax.readers import FORMATS, aedat, open_recording
 from firenet_jax.settings import parse_size
 from firenet_jax.storage.files import identity, named, read_arrays, write_arrays, write_text
 from firenet_jax.storage.progress import bar
@@ -43,7 +43,7 @@ from firenet_jax.storage.video import write_video
 from firenet_jax.windows import Windows
 
 # Formats that can hold frames.
-SUFFIXES = (".h5", ".hdf5", ".hdf", ".zip", ".bag", ".mcap", ".aedat", ".aedat4")
+SUFFIXES = (".h5", ".hdf5", ".hdf", ".zip", ".bag", ".mcap", ".db3", *aedat.SUFFIXES)
 MAX_VIDEO_WIDTH = 2000  # pixels
 
 
@@ -70,8 +70,8 @@ class Evaluate:
     """Comma-separated: firenet, e2vid, hf (high-pass filter), mr (manifold regularisation).
     Default: all, e2vid only if its weights are given."""
     weights: Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["-c"])] = ()
-    """Weights of FireNet or FireNet+; each file is a method named after it. Default: the built-in
-    weights."""
+    """Weights of FireNet or FireNet+; each file or run's folder is a method named after it.
+    Default: the built-in weights."""
     e2vid_weights: Path | None = None
     """E2VID's published checkpoint, or E2VID+'s."""
     e2vid_sigmoid: bool = True
@@ -147,7 +147,7 @@ class Evaluate:
 def run(settings: Evaluate) -> dict:
     """Does what the settings say; returns what results.json holds. Raises RecordingError,
     CheckpointError, OutputError or SettingsError with a message of one sentence."""
-    sequences = find_sequences(settings.data)
+    paths = find_sequences(settings.data)
     methods = load(
         settings.method_names,
         settings.weights,
@@ -156,10 +156,10 @@ def run(settings: Evaluate) -> dict:
         e2vid_sigmoid=settings.e2vid_sigmoid,
     )
     learned = None if settings.lpips is None else lpips.load(*settings.lpips)
-    size = parse_size(settings.sensor_size)
     if settings.output.is_file():
         raise OutputError(f"{settings.output} is a file: choose another name for the folder")
-    recordings = {name: open_recording(path, size, True) for name, path in sequences.items()}
+    sequences = {name: opened(path, settings) for name, path in paths.items()}
+    recordings = {name: one for name, one in sequences.items() if isinstance(one, Recording)}
     shared = describe(settings, learned)
     records = {
         (name, method.name): describe_one(shared, recording, method)
@@ -172,10 +172,11 @@ def run(settings: Evaluate) -> dict:
 
         plans: dict[str, Plan] = {}
         gaps = {
-            (name, method.name): method.reason
-            for name in recordings
+            (name, method.name): one.reason
+            for name, sequence in sequences.items()
             for method in methods
-            if isinstance(method, Missing)
+            for one in (sequence, method)
+            if isinstance(one, (Unopened, Missing))
         }
         for name, recording in recordings.items():
             try:
@@ -190,7 +191,7 @@ def run(settings: Evaluate) -> dict:
             reason = next(iter(gaps.items()), (("", ""), "no method can run"))
             raise RecordingError(f"nothing can be evaluated: {' / '.join(reason[0])}: {reason[1]}")
 
-        results = summarise(settings, shared, plans, recordings, methods, done, gaps)
+        results = summarise(settings, shared, plans, sequences, methods, done, gaps)
         write_all(settings, results, plans, [key for key in records if key in done])
         return results
 
@@ -262,6 +263,24 @@ def recordings_in(folder: Path) -> list[Path]:
         elif path.suffix.lower() in SUFFIXES and ".partial" not in path.name:
             found.append(path)
     return found
+
+
+class Unopened(NamedTuple):
+    """What lies in a folder of recordings, but cannot be opened."""
+
+    path: Path
+    reason: str
+
+
+def opened(path: Path, settings: Evaluate) -> Recording | Unopened:
+    """Raises RecordingError for what cannot be opened, but was named itself."""
+    try:
+        return open_recording(path, parse_size(settings.sensor_size), True)
+    except RecordingError as error:
+        if path in settings.data:
+            raise
+        logger.warning("%s", error)
+        return Unopened(path, str(error))
 
 
 # ---- Results on disk
@@ -343,20 +362,21 @@ def save(path: Path, record: dict, result: Measured, pictures: dict[str, np.ndar
 # ---- Tables
 
 
-def summarise(settings, shared, plans, recordings, methods, done, gaps) -> dict:
+def summarise(settings, shared, plans, found, methods, done, gaps) -> dict:
     """What results.json holds: settings, numbers of each sequence and method, means."""
     sequences = {}
-    for name, recording in recordings.items():
+    for name, sequence in found.items():
+        recording = sequence if isinstance(sequence, Recording) else None
         entries = {}
         for method in methods:
             key = name, method.name
-            found = done.get(key)
-            entries[method.name] = {"gap": gaps[key]} if found is None else summary(found)
-        start, stop = settings.protocol.interval(recording.path)
+            result = done.get(key)
+            entries[method.name] = {"gap": gaps[key]} if result is None else summary(result)
+        start, stop = settings.protocol.interval(sequence.path)
         sequences[name] = {
-            "path": str(recording.path),
-            "format": recording.format,
-            "sensor": [recording.width, recording.height],
+            "path": str(sequence.path),
+            "format": recording and recording.format,
+            "sensor": recording and [recording.width, recording.height],
             "counted_seconds": [start, None if math.isinf(stop) else stop],
             "images": None if name not in plans else settings.protocol.images_in_words(plans[name]),
             "methods": entries,

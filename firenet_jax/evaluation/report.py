@@ -211,11 +211,9 @@ def page(results: dict, shown: dict[str, Shown]) -> str:
     links = (f'<a href="#{_anchor(k)}">{escape(name)}</a>' for k, name in enumerate(sequences))
     parts.append(f"<nav>{''.join(links)}</nav>")
     for number, (name, facts) in enumerate(sequences.items()):
-        width, height = facts["sensor"]
         parts += [
             f'<section><h2 id="{_anchor(number)}">{escape(name)}</h2>',
-            f"<p>{escape(facts['format'])}, {width}x{height}; counted: {_interval(facts)}; "
-            f"{escape(facts['images'] or 'no images')}</p>",
+            f"<p>{escape(_described(facts))}</p>",
             f"<div class=wide>{_table(results, facts['methods'], colours, 'method')}</div>",
         ]
         if name in shown:
@@ -248,6 +246,17 @@ def made(results: dict) -> str:
 
 def _anchor(number: int) -> str:
     return f"sequence-{number + 1}"
+
+
+def _described(facts: dict) -> str:
+    """A sequence's format, size, what of it counts and what its images are."""
+    if facts["sensor"] is None:
+        return "not opened"
+    width, height = facts["sensor"]
+    return (
+        f"{facts['format']}, {width}x{height}; counted: {_interval(facts)}; "
+        f"{facts['images'] or 'no images'}"
+    )
 
 
 def _interval(facts: dict) -> str:
