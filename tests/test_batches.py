@@ -249,6 +249,19 @@ def test_events_of_another_clock_than_the_images_are_said(tmp_path):
     assert "none of its 4,000 events is between its images" in refused(file)
 
 
+def test_images_are_in_the_order_of_their_numbers(tmp_path, noise):
+    """`image10` comes after `image2`, though its name sorts before."""
+    path = tmp_path / "a.h5"
+    path.write_bytes(noise[0].read_bytes())
+    with h5py.File(path, "r+") as file:
+        for kind in ("image", "flow"):
+            folder = file["images" if kind == "image" else kind]
+            for name in list(folder):
+                folder.move(name, f"{kind}{int(name.removeprefix(kind))}")
+    for found, expected in zip(take([path], 3), take(noise[:1], 3), strict=True):
+        assert same(found, expected)
+
+
 def test_a_further_batch_compiles_nothing(noise):
     _simulation.clear_cache()
     take(noise, 4)
