@@ -138,6 +138,7 @@ def to_torch(array, memory_format=NCHW) -> torch.Tensor:
     return tensor.contiguous(memory_format=memory_format) if tensor.ndim == 4 else tensor
 
 
+@torch.inference_mode()
 def in_graph(model, inputs):
     """The model on these inputs as one CUDA graph, captured after warming up on another stream."""
     stream = torch.cuda.Stream()
@@ -150,7 +151,7 @@ def in_graph(model, inputs):
     with torch.cuda.graph(graph):
         results = model(*inputs)
 
-    def replay(*new):
+    def replay(*new, kept=model):  # a graph knows where its weights are, it does not own them
         for own, given in zip(inputs, new, strict=True):
             if own is not given:
                 own.copy_(given)
