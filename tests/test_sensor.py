@@ -24,10 +24,12 @@ from firenet_jax.simulation.sensor import (
     event_list,
     random_sensor,
     simulate,
+    to_and_fro,
     with_faults,
 )
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.tensors import pack, voxelise
+from firenet_jax.warp import warp
 
 H, W = 12, 14
 
@@ -554,6 +556,35 @@ def test_simulation_goes_on_where_it_ended(simulated, scenes):
         parts.append(made.tensors)
     error = jnp.abs(jnp.concatenate(parts) - simulated.simulation.tensors).max(-1)
     assert (error <= 1e-4).mean() >= 0.999
+
+
+@pytest.mark.optimised
+@pytest.mark.parametrize("windows", [T, T - 1])
+def test_to_and_fro_is_the_same_windows_forward_and_backward(simulated, scenes, windows):
+    """Backward a window ends where it began, its events are in reverse order and inverted, and
+    displacements lead from its end to its beginning, as warping the one truth to the next shows."""
+    data = jax.tree.map(lambda part: part[:windows], simulated.simulation)
+    bounds = simulated.bounds[: windows + 1]
+    made = jax.jit(partial(to_and_fro, **SQUARE))(data, scenes, bounds)
+    half, odd = divmod(windows, 2)
+    order = [*range(half), *reversed(range(half)), *range(odd)]
+    back = [False] * half + [True] * half + [False] * odd
+    first = jnp.stack(
+        [next(video(of_sequence(scenes, b), bounds[:1, b], **SQUARE))[1] for b in range(B)]
+    )
+    for k, (window, reverse) in enumerate(zip(order, back, strict=True)):
+        tensors = data.tensors[window]
+        np.testing.assert_array_equal(made.tensors[k], -tensors[..., ::-1] if reverse else tensors)
+        before = data.images[window - 1] if window else first
+        truth = before if reverse else data.images[window]
+        np.testing.assert_allclose(made.images[k], truth, atol=1e-4)
+        if k:
+            warped, _ = warp(made.images[k - 1], made.displacement[k])
+            error = jnp.abs(warped - made.images[k])
+            forward = jnp.abs(warp(first, data.displacement[0])[0] - data.images[0])
+            assert made.visible[k].mean() > 0.5
+            limit = 2 * forward[data.visible[0]].mean()
+            assert error[made.visible[k]].mean() < limit
 
 
 @pytest.mark.optimised

@@ -234,6 +234,26 @@ def test_sequences_of_a_batch_are_of_different_ages_and_go_on_where_they_were(tm
     assert not np.allclose(seen[6:, 0], first[6:, 0], atol=0.5)
 
 
+@pytest.mark.optimised
+def test_sequences_to_and_fro_are_the_same_windows_in_every_step(tmp_path):
+    asked = tiny(tmp_path, chain=4, windows=6, to_and_fro=1.0, loss=Loss(l0=2))
+    textures, key = jnp.asarray(load_textures(None, 4, 64, 0, procedural=1.0)), jax.random.key(1)
+    make = jax.jit(partial(train_steps._simulated, settings=asked.step_settings))
+    state, seen, warm = first_state(asked), [], []
+    for step in range(3):
+        data, carried, known = make(key, textures, state=state._replace(step=jnp.int32(step)))
+        state = state._replace(carried=carried)
+        seen.append(data.tensors)
+        warm.append(known.tolist())
+    assert warm == [[False, False], [True, True], [False, True]]  # lengths are 2 and 4
+    for now in seen:
+        np.testing.assert_array_equal(now[3:], -now[2::-1, ..., ::-1])
+        assert jnp.abs(now).sum((0, 2, 3, 4)).min() > 0
+    np.testing.assert_array_equal(seen[0], seen[1])
+    np.testing.assert_array_equal(seen[1][:, 1], seen[2][:, 1])
+    assert not np.allclose(seen[1][:, 0], seen[2][:, 0], atol=0.5)
+
+
 @pytest.mark.slow
 def test_remat_and_bfloat16_change_little(tmp_path):
     settings = tiny(tmp_path)
@@ -447,6 +467,7 @@ def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypa
         ({"log_every": 0}, "log_every"), ({"validate_every": 0}, "validate_every"),
         ({"crop": 10}, "smaller than 11"), ({"procedural": 3.0}, "procedural"),
         ({"slow": 0.5, "swift": 0.5}, "slow is 0.5 and swift is 0.5"),
+        ({"to_and_fro": 1.5}, "to_and_fro is 1.5, but is a part of the sequences"),
         ({"motion": (0.0, 2.0)}, "motion is 0 2"), ({"motion": (2.0, 1.0)}, "the least first"),
         ({"seed": -3}, "seed is -3"), ({"seed": 5_000_000_000}, "less than 2"),
     ],

@@ -581,6 +581,30 @@ def simulate(
     return jax.lax.scan(window, state, (bounds[:-1], bounds[1:]))
 
 
+def to_and_fro(
+    data: Simulation, scenes: Scene, bounds: jax.Array, *, height: int, width: int
+) -> Simulation:
+    """T windows -> T windows: the first T // 2 forward and then backward, and so on.
+
+    Backward, time is reversed and polarity inverted: bins in reverse order, votes negated. Truth
+    and displacement are those of the scene. An odd T ends with the first window again.
+    bounds: (T + 1, B) int32, as in `simulate`.
+    """
+    half = len(data.images) // 2
+    draw = partial(_draw, height=height, width=width)
+    move = jax.vmap(partial(flow, height=height, width=width))
+    seconds = 1e-6 * bounds[half::-1]  # of the ends of windows, backward
+    displacement, visible = jax.lax.map(
+        lambda ends: move(scenes, *ends), (seconds[:-1], seconds[1:])
+    )
+    images = jnp.concatenate([data.images[: half - 1][::-1], draw(scenes, seconds[-1])[None]])
+    back = Simulation(-data.tensors[:half][::-1, ..., ::-1], images, displacement, visible)
+    rest = len(data.images) - 2 * half
+    return jax.tree.map(
+        lambda forth, back: jnp.concatenate([forth[:half], back, forth[:rest]]), data, back
+    )
+
+
 def _votes(planes: jax.Array, low, runs, passed: jax.Array, total: jax.Array) -> jax.Array:
     """Adds the votes of runs (B, H, W) by Eq. 1 to planes (n, B, H, W), the bins from `low` on.
 

@@ -73,6 +73,9 @@ class Train:
     swift: float = 0.0
     """Share of the sequences with a motion of 16 to 90 pixels per window, over a plain
     background."""
+    to_and_fro: float = 0.0
+    """Share of the sequences in which every step is the same windows, forward and then backward
+    (time reversed, polarity inverted), to teach the network to remember."""
     learning_rate: float = 1e-3
     """Peak learning rate, after the warm-up; it then decays to a hundredth along a cosine."""
     warmup: int = 200
@@ -139,6 +142,10 @@ class Train:
             )
         check_range("motion", self.motion)
         check_rare(self.slow, self.swift)
+        if not 0 <= self.to_and_fro <= 1:
+            raise SettingsError(
+                f"to_and_fro is {self.to_and_fro}, but is a part of the sequences, 0-1"
+            )
         check_seed(self.seed)
         if not self.save_every >= 0:
             raise SettingsError(f"save_every is {self.save_every} seconds, but must be 0 or more")

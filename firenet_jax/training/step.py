@@ -33,6 +33,7 @@ from firenet_jax.simulation.sensor import (
     Simulation,
     first_states,
     simulate,
+    to_and_fro,
 )
 from firenet_jax.tensors import normalise
 from firenet_jax.training.losses import Loss, sequence_loss
@@ -58,6 +59,7 @@ class StepSettings:
     motion: tuple[float, float]
     slow: float
     swift: float
+    to_and_fro: float
     learning_rate: float
     warmup: int
     optimiser: Literal["muon", "adam"]
@@ -189,22 +191,40 @@ def _simulated(
     step = jnp.int32(0) if state is None else state.step
     numbers, parts = step // lengths, step % lengths
     sensors, scenes, durations = _setups(key, textures, settings, lengths, numbers)
-    bounds = window_bounds(durations, settings.windows, parts * settings.windows)
+    returns = _going_to_and_fro(key, settings, numbers)  # each of their steps is the first again
+    simulated = jnp.where(returns, 0, parts)
+    bounds = window_bounds(durations, settings.windows, simulated * settings.windows)
     carried = state.carried if state is not None and chained else None
 
-    def one_device(sensors, scenes, bounds, carried, parts):
+    def one_device(sensors, scenes, bounds, carried, parts, simulated, returns):
         seen, remembered = _fresh(sensors, scenes, bounds[0], settings)
         if chained:
             choose = jax.vmap(partial(jnp.where))
-            seen, remembered = jax.tree.map(partial(choose, parts > 0), carried, (seen, remembered))
+            seen = jax.tree.map(partial(choose, simulated > 0), carried[0], seen)
+            remembered = jax.tree.map(partial(choose, parts > 0), carried[1], remembered)
         size = {"height": settings.crop, "width": settings.crop}
         seen, data = simulate(sensors, scenes, bounds, seen, renderings=settings.renderings, **size)
+        if settings.to_and_fro:
+            choose = jax.vmap(partial(jnp.where), (0, 1, 1), 1)
+            data = jax.tree.map(
+                partial(choose, returns), to_and_fro(data, scenes, bounds, **size), data
+            )
         return data, (seen, remembered)
 
-    specs = BATCH, BATCH, TIME_BATCH, BATCH, BATCH
+    specs = BATCH, BATCH, TIME_BATCH, BATCH, BATCH, BATCH, BATCH
     on_each = on_each_device(one_device, specs, (TIME_BATCH, BATCH))
-    data, states = on_each(sensors, scenes, bounds, carried, parts)
+    data, states = on_each(sensors, scenes, bounds, carried, parts, simulated, returns)
     return data, states, parts > 0 if chained else False
+
+
+def _going_to_and_fro(key: jax.Array, settings: StepSettings, numbers: jax.Array) -> jax.Array:
+    """(B,) bool: which sequences do so; numbers as in `_setups`."""
+
+    def one(place, number):
+        of_one = jax.random.fold_in(jax.random.fold_in(key, place), number)
+        return jax.random.uniform(jax.random.fold_in(of_one, 1)) < settings.to_and_fro
+
+    return jax.vmap(one)(jnp.arange(settings.batch), numbers)
 
 
 # ---- Steps
