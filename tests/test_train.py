@@ -22,7 +22,7 @@ from firenet_jax.events import Events
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.simulation.curricula import window_bounds
 from firenet_jax.simulation.scenes import SceneSettings
-from firenet_jax.simulation.sensor import FAULTY, simulate
+from firenet_jax.simulation.sensor import FAULTY, Simulation, simulate
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage.files import locked
 from firenet_jax.storage.sequence_file import Picture, write_sequence
@@ -252,6 +252,22 @@ def test_sequences_to_and_fro_are_the_same_windows_in_every_step(tmp_path):
     np.testing.assert_array_equal(seen[0], seen[1])
     np.testing.assert_array_equal(seen[1][:, 1], seen[2][:, 1])
     assert not np.allclose(seen[1][:, 0], seen[2][:, 0], atol=0.5)
+
+
+def test_frozen_blocks_keep_the_weights_they_start_from(tmp_path):
+    loss = Loss(l1=1.0, nlpd=0.0, haarpsi=0.0, lambda_tc=0.0, l0=0)
+    settings = tiny(tmp_path, windows=2, frozen=("gru2", "head"), loss=loss)
+    state, shape = first_state(settings), (2, 2, 16, 16)
+    data = Simulation(
+        jax.random.normal(jax.random.key(0), (*shape, 5)), jnp.full(shape, 0.3),
+        jnp.zeros((*shape, 2)), jnp.ones(shape, bool),
+    )  # fmt: skip
+    update = jax.jit(partial(train_steps._updated, settings=settings.step_settings, warm=False))
+    after, *_ = update(state._replace(step=jnp.int32(1)), data, None)
+    after, *_ = update(after, data, None)  # the rate of the first step is 0
+    for name, block in after.params.items():
+        same = jax.tree.map(lambda a, b: bool((a == b).all()), block, state.params[name])
+        assert all(jax.tree.leaves(same)) == (name in ("gru2", "head")), name
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ from firenet_jax.training.batches import Augment, is_set
 from firenet_jax.training.losses import DISTANCES, Loss
 from firenet_jax.training.step import StepSettings
 
+Block = Literal["head", "gru1", "res1", "gru2", "res2", "prediction"]
 MIN_CROP = 11  # pixels on a side of what validation measures: SSIM's window
 
 
@@ -85,6 +86,8 @@ class Train:
     learning rate has the same scale for both: the size of an update."""
     clip: float = 1.0
     """Clip gradients to this norm."""
+    frozen: tuple[Block, ...] = ()
+    """Blocks of the network that keep the weights they start from."""
     seed: int = 0
     """Random seed of the initial parameters, the textures and the sequences."""
     bfloat16: bool = False

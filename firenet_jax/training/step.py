@@ -64,6 +64,7 @@ class StepSettings:
     warmup: int
     optimiser: Literal["muon", "adam"]
     clip: float
+    frozen: tuple[str, ...]
     bfloat16: bool
     remat: bool
     near_events: bool
@@ -291,6 +292,8 @@ def _updated(
     both = jax.value_and_grad(loss_of, has_aux=True)
     (loss, (terms, last, _)), gradient = both(state.params, data, before, warm, settings)
     updates, optimised = optimiser(settings).update(gradient, state.optimiser, state.params)
+    blocks = cast(dict[str, Any], updates)
+    updates = blocks | {k: jax.tree.map(jnp.zeros_like, blocks[k]) for k in settings.frozen}
     params = optax.apply_updates(state.params, updates)
     terms = {"loss": loss, "gradient": optax.tree.norm(gradient), **terms}
     return state._replace(params=params, optimiser=optimised, step=state.step + 1), terms, last
