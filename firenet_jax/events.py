@@ -170,8 +170,9 @@ def checked(
 
     Time must not run backwards, within a chunk or between chunks. x and y must not be negative or
     lie outside the sensor, if its size is known. Of rows out of order, as few as possible are
-    dropped, of those at the end of a chunk, too: it is passed on when the next one has come. At the
-    end, `say(sentence, count)` reports what was dropped, and damage that ended the reading early.
+    dropped. A chunk is held until the next one has come, for its last rows may be the wrong ones;
+    chunks must be long for that. At the end, `say(sentence, count)` reports what was dropped, and
+    damage that ended the reading early.
     Raises RecordingError for the first bad row if more than one in a thousand rows so far are bad,
     and for damage before the first event; with `strict`, for any bad row or damage. `place(row)`
     names a row (counted from 0 over the whole recording) in the file's own terms, such as "line 7".

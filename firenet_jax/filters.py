@@ -83,8 +83,9 @@ def hot_pixels_of(counts: np.ndarray) -> np.ndarray:
     hot = counts >= 10 * np.maximum(median_filter(counts, size=5, mode="reflect"), 1)
     while True:  # fewer each time; where few pixels are active the hot ones would set the mean
         others = counts[(counts > 0) & ~hot]
+        others = others if others.size else counts[counts > 0]  # all stand alone
         if others.size == 0:
-            return np.zeros(counts.shape, bool)
+            return hot
         usual = hot & (counts <= others.mean() + 6 * others.std())
         if not usual.any():
             return hot

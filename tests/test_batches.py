@@ -373,6 +373,7 @@ def instead(file: h5py.File, name: str):
         (lambda f: instead(f, "images/image000000000"), "cannot be read"),
         (lambda f: instead(f, "events/ts"), "cannot be read"),
         (lambda f: f["events/xs"].write_direct(np.full(4000, 99, np.int16)), "x is 99, outside"),
+        (lambda f: f["events/xs"].__setitem__(1500, 99), "event 1501: x is 99, outside"),
         (lambda f: f["events/ts"].write_direct(f["events/ts"][:][::-1].copy()), "runs backwards"),
         (lambda f: f["events/ts"].__setitem__(7, np.nan), "event 8: the time is nan"),
         (lambda f: f["images/image000000003"].attrs.update(timestamp=0.0), "image 3: its time"),

@@ -112,3 +112,7 @@ def test_hot_pixels_are_found_where_few_others_are_active():
     hot[:, 36:] = False
     np.testing.assert_array_equal(filters.hot_pixels_of(np.where(hot, 2000, counts)), hot)
     assert not filters.hot_pixels_of(np.where(hot, 1000, 0)).any()  # nothing tells what is usual
+    lonely = np.zeros((60, 80), int)
+    lonely[::5, ::6] = 20
+    lonely[30, 30] = 100_000
+    np.testing.assert_array_equal(filters.hot_pixels_of(lonely), lonely > 20)

@@ -484,6 +484,7 @@ def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypa
         ({"crop": 10}, "smaller than 11"), ({"procedural": 3.0}, "procedural"),
         ({"slow": 0.5, "swift": 0.5}, "slow is 0.5 and swift is 0.5"),
         ({"to_and_fro": 1.5}, "to_and_fro is 1.5, but is a part of the sequences"),
+        ({"to_and_fro": 0.5, "windows": 3}, "windows is 3, but as many lead to and fro"),
         ({"motion": (0.0, 2.0)}, "motion is 0 2"), ({"motion": (2.0, 1.0)}, "the least first"),
         ({"seed": -3}, "seed is -3"), ({"seed": 5_000_000_000}, "less than 2"),
     ],

@@ -175,7 +175,7 @@ def run(settings: Evaluate) -> dict:
             (name, method.name): one.reason
             for name, sequence in sequences.items()
             for method in methods
-            for one in (sequence, method)
+            for one in (method, sequence)  # of both, the file's
             if isinstance(one, (Unopened, Missing))
         }
         for name, recording in recordings.items():

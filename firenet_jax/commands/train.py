@@ -159,13 +159,12 @@ def write_sequences(cuts: list[Cut], settings: Train) -> None:
             runs.check_same(found, record, f"{folder} holds sequences of others", way_out)
         write_text(folder / "settings.json", runs.as_text(record))
         runs.make_folder(folder / "validation")
-        parts = _parts(cuts, folder)
+        new = {path: part for path, part in _parts(cuts, folder).items() if not path.exists()}
         try:
-            for path, part in parts.items():
-                if not path.exists():
-                    _write(path, *part)
+            for path, part in new.items():
+                _write(path, *part)
         except RecordingError:
-            for path in (*parts, folder / "settings.json"):
+            for path in (*new, *([folder / "settings.json"] if found is None else [])):
                 path.unlink(missing_ok=True)
             raise
 
@@ -267,11 +266,11 @@ def judged(weights: Weights, one: Cut, near: bool) -> Score:
         state, images = reconstruct(weights, state, tensors)
         near_now = near_events(tensors) | seen
         seen = near_now[-1:]
-        counted = [k for k, (number, _) in enumerate(group) if number > one.end]
-        if counted:
-            truths = np.stack([one.frame(group[k][0]) for k in counted]) / np.float32(255)
-            there = near_now[np.array(counted), 0] if near else np.ones(truths.shape, bool)
-            chosen = np.clip(images[np.array(counted), 0], 0, 1)
+        later = [k for k, (number, _) in enumerate(group) if number > one.end]
+        if later:
+            truths = np.stack([one.frame(group[k][0]) for k in later]) / np.float32(255)
+            there = near_now[np.array(later), 0] if near else np.ones(truths.shape, bool)
+            chosen = np.clip(images[np.array(later), 0], 0, 1)
             pairs = (chosen, truths), (equalise(chosen, "global"), equalise(truths, "global"))
             scores.append(np.stack([metrics.ssim_where(*pair, there) for pair in pairs], -1))
     found = np.concatenate([np.zeros((0, 2)), *scores])

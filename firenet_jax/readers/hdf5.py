@@ -202,13 +202,14 @@ def _frames(path: Path, file: Any, layout: str) -> Frames | None:
 
 
 def in_order(names: Iterable[str]) -> list[str]:
-    """Names of pictures -> by the numbers at their ends, which some programs write without zeros:
-    image2 comes before image10."""
+    """Names of pictures -> in their order, but by the numbers at their ends, which some programs
+    write without zeros: image2 comes before image10."""
 
-    def number(name: str) -> int:
-        return int("0" + name[len(name.rstrip("0123456789")) :])
+    def parts(name: str) -> tuple[str, int, str]:
+        before = name.rstrip("0123456789")
+        return before, int("0" + name[len(before) :]), name
 
-    return sorted(names, key=lambda name: (number(name), name))
+    return sorted(names, key=parts)
 
 
 def _mvsec_frames(path: Path, left: Any) -> Frames | None:

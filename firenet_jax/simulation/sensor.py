@@ -584,10 +584,10 @@ def simulate(
 def to_and_fro(
     data: Simulation, scenes: Scene, bounds: jax.Array, *, height: int, width: int
 ) -> Simulation:
-    """T windows -> T windows: the first T // 2 forward and then backward, and so on.
+    """T windows, an even number -> T windows: the first half forward and then backward.
 
     Backward, time is reversed and polarity inverted: bins in reverse order, votes negated. Truth
-    and displacement are those of the scene. An odd T ends with the first window again.
+    and displacement are those of the scene.
     bounds: (T + 1, B) int32, as in `simulate`.
     """
     half = len(data.images) // 2
@@ -599,10 +599,7 @@ def to_and_fro(
     )
     images = jnp.concatenate([data.images[: half - 1][::-1], draw(scenes, seconds[-1])[None]])
     back = Simulation(-data.tensors[:half][::-1, ..., ::-1], images, displacement, visible)
-    rest = len(data.images) - 2 * half
-    return jax.tree.map(
-        lambda forth, back: jnp.concatenate([forth[:half], back, forth[:rest]]), data, back
-    )
+    return jax.tree.map(lambda forth, back: jnp.concatenate([forth[:half], back]), data, back)
 
 
 def _votes(planes: jax.Array, low, runs, passed: jax.Array, total: jax.Array) -> jax.Array:

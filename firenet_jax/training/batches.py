@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.errors import RecordingError, SettingsError, logger
-from firenet_jax.events import BINS, Events, Rows, checked, counted, event_number
+from firenet_jax.events import BINS, Events, Rows, checked, concatenate, counted, event_number
 from firenet_jax.readers import CHUNK, frame_times, to_events, to_frame
 from firenet_jax.readers.hdf5 import in_order, opened
 from firenet_jax.simulation.sensor import Simulation
@@ -270,7 +270,7 @@ def _read_events(file: Any, facts: Facts, rows: slice) -> Events:
     right = checked(
         [events], facts.path, facts.height, facts.width, lambda row: event_number(rows.start + row)
     )
-    return next(right, Events.empty())
+    return concatenate([*right] or [Events.empty()])
 
 
 def _cropped(events: Events, top, left, crop: int, down, across) -> Events:

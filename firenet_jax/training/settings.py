@@ -75,8 +75,9 @@ class Train:
     """Share of the sequences with a motion of 16 to 90 pixels per window, over a plain
     background."""
     to_and_fro: float = 0.0
-    """Share of the sequences in which every step is the same windows, forward and then backward
-    (time reversed, polarity inverted), to teach the network to remember."""
+    """Share of the simulated sequences in which every step is the same windows, forward and then
+    backward (time reversed, polarity inverted), to teach the network to remember. Needs an even
+    number of windows, and a chain."""
     learning_rate: float = 1e-3
     """Peak learning rate, after the warm-up; it then decays to a hundredth along a cosine."""
     warmup: int = 200
@@ -148,6 +149,10 @@ class Train:
         if not 0 <= self.to_and_fro <= 1:
             raise SettingsError(
                 f"to_and_fro is {self.to_and_fro}, but is a part of the sequences, 0-1"
+            )
+        if self.to_and_fro and self.windows % 2:
+            raise SettingsError(
+                f"windows is {self.windows}, but as many lead to and fro: choose an even number"
             )
         check_seed(self.seed)
         if not self.save_every >= 0:

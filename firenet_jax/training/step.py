@@ -193,6 +193,8 @@ def _simulated(
     numbers, parts = step // lengths, step % lengths
     sensors, scenes, durations = _setups(key, textures, settings, lengths, numbers)
     returns = _going_to_and_fro(key, settings, numbers)  # each of their steps is the first again
+    if state is None:  # validation is the same with and without
+        returns = jnp.zeros_like(returns)
     simulated = jnp.where(returns, 0, parts)
     bounds = window_bounds(durations, settings.windows, simulated * settings.windows)
     carried = state.carried if state is not None and chained else None
@@ -223,7 +225,8 @@ def _going_to_and_fro(key: jax.Array, settings: StepSettings, numbers: jax.Array
 
     def one(place, number):
         of_one = jax.random.fold_in(jax.random.fold_in(key, place), number)
-        return jax.random.uniform(jax.random.fold_in(of_one, 1)) < settings.to_and_fro
+        # Split in three, and folded with 1 and 2, it gives other numbers elsewhere.
+        return jax.random.uniform(jax.random.fold_in(of_one, 3)) < settings.to_and_fro
 
     return jax.vmap(one)(jnp.arange(settings.batch), numbers)
 
