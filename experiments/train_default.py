@@ -42,9 +42,9 @@ material-kit(-react), now-ui-kit, paper-kit-2, shards-ui, soft-ui-design-system,
 startbootstrap-agency, -business-casual, -clean-blog, -creative, -landing-page, -one-page-wonder and
 -stylish-portfolio, stisla, @tabler/preview, tracking, uikit and @vladmandic/face-api, and of
 foolbox, gradio, imgaug, mahotas, scikit-image and thumbor; of stellarium-data's nebulae one in six.
-"clear" had 910, "bare" and those after it 873 to 878, of the same packages. "vast" and "tidal" had
-1,122 of packages named here, shrunk to 384 pixels on the shorter side. No picture of
-`textures.HELD_OUT` was among any of them.
+"clear" had 910, "bare" and those after it 873 to 878, of the same packages. "vast" had 1,122
+of packages named here, shrunk to 384 pixels on the shorter side. No picture of `textures.HELD_OUT`
+was among any of them.
 
 Built in is RUN/weights.npz, a mean of the last weights of stages (Wortsman et al., "Model soups",
 ICML 2022); several stages began from such a mean. What was averaged was chosen by the sequences of
@@ -650,7 +650,8 @@ DAWN = replace(
 # of "dawn", a quarter each of "night" and "gloaming" and a third of what is built in. Pictures of
 # simulated scenes and cameras' frames are better than ever, and it rests; but a recording that is
 # played to and fro sinks to dark. That memory is in the second ConvGRU: with that of the mean which
-# it began from, what comes back stays, and half of the gain is lost.
+# it began from, what comes back stays, and half of the gain is lost. (Windows played to and fro in
+# two to five tenths of the sequences, four in a step on a CPU, brought memory and took pictures.)
 VAST = replace(
     CLEAR,
     steps=1446,
@@ -673,23 +674,6 @@ VAST = replace(
     ),
     scene=replace(CLEAR.scene, halt=0.35, still=0.08, shake=0.12),
     sensor=replace(CLEAR.sensor, clean=0.5, noise=(3e-3, 30.0), noise_in_light=(0.01, 0.5)),
-)
-# From these two: all but the second ConvGRU learns to go with it, and windows are played to and fro
-# in three tenths of the sequences.
-TIDAL = replace(
-    VAST,
-    steps=450,
-    batch=4,
-    windows=20,
-    chain=40,
-    to_and_fro=0.3,
-    frozen=("gru2",),
-    learning_rate=8e-4,
-    warmup=10,
-    seed=441,
-    validate_every=75,
-    loss=replace(VAST.loss, L=20),
-    scene=replace(VAST.scene, still=0.1, shake=0.0),
 )
 STAGES = {
     "clean": (CLEAN, STOP),
