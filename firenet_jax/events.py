@@ -154,6 +154,7 @@ def event_number(row: int) -> str:
     return f"event {row + 1}"
 
 
+HELD = 1000  # rows at the end of a chunk that wait for the next one
 MAX_BAD_SHARE = 1e-3  # of the rows; if more are bad, the whole file is suspect
 
 
@@ -170,7 +171,7 @@ def checked(
 
     Time must not run backwards, within a chunk or between chunks. x and y must not be negative or
     lie outside the sensor, if its size is known. Of rows out of order, as few as possible are
-    dropped. A chunk is held until the next one has come, for its last rows may be the wrong ones;
+    dropped. The end of a chunk is held until the next one has come, for it may be what is wrong;
     chunks must be long for that. At the end, `say(sentence, count)` reports what was dropped, and
     damage that ended the reading early.
     Raises RecordingError for the first bad row if more than one in a thousand rows so far are bad,
@@ -178,7 +179,7 @@ def checked(
     names a row (counted from 0 over the whole recording) in the file's own terms, such as "line 7".
     """
     rows, dropped, first_error = 0, 0, None
-    held, before = Events.empty(), -MAX_TIME  # a chunk that waits, and the last time before it
+    held, before = Events.empty(), -MAX_TIME  # a chunk's end, and the last time before it
     try:
         for chunk in _with_damage(chunks):
             if isinstance(chunk, RecordingError):
@@ -195,7 +196,9 @@ def checked(
             if isinstance(chunk, Events) and _is_right(events, last, height, width):
                 rows, before = rows + len(events), last
                 yield from _unless_empty(held)
-                held = events
+                ready, held = _parted(events)
+                before = ready.t[-1] if len(ready) else before
+                yield from _unless_empty(ready)
                 continue
             first, error = _first_error(chunk, path, last, height, width, place, rows)
             bad = _known(chunk) | _outside(events, height, width)
@@ -212,7 +215,9 @@ def checked(
             held = held.select(~wrong) if wrong.any() else held
             before = held.t[-1] if len(held) else before
             yield from _unless_empty(held)
-            held = events.select(~fewest)
+            ready, held = _parted(events.select(~fewest))
+            before = ready.t[-1] if len(ready) else before
+            yield from _unless_empty(ready)
         yield from _unless_empty(held)
     finally:
         if dropped:
@@ -225,6 +230,12 @@ def _with_damage(chunks: Iterable[Events | Rows]) -> Iterator[Events | Rows | Re
         yield from chunks
     except RecordingError as error:
         yield error
+
+
+def _parted(events: Events) -> tuple[Events, Events]:
+    """What can be passed on, and the end that waits for what follows."""
+    place = max(len(events) - HELD, 0)
+    return events.select(slice(place)), events.select(slice(place, None))
 
 
 def _unless_empty(events: Events) -> tuple[Events, ...]:
