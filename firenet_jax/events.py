@@ -193,31 +193,26 @@ def checked(
             if len(events) == 0:
                 continue
             last = held.t[-1] if len(held) else before
-            if isinstance(chunk, Events) and _is_right(events, last, height, width):
-                rows, before = rows + len(events), last
-                yield from _unless_empty(held)
-                ready, held = _parted(events)
-                before = ready.t[-1] if len(ready) else before
-                yield from _unless_empty(ready)
-                continue
-            first, error = _first_error(chunk, path, last, height, width, place, rows)
-            bad = _known(chunk) | _outside(events, height, width)
-            wrong, fewest = _fewest(held, events, bad, before)
-            count = int(wrong.sum() + fewest.sum())
-            if strict or dropped + count > MAX_BAD_SHARE * (rows + len(events)):
-                yield from _unless_empty(held)
-                if first:  # so that a caller who stops before the damage never meets it
-                    yield events.select(slice(first))
-                dropped = 0  # the error already says it
-                raise error
-            first_error = first_error or error
-            rows, dropped = rows + len(events), dropped + count
-            held = held.select(~wrong) if wrong.any() else held
-            before = held.t[-1] if len(held) else before
-            yield from _unless_empty(held)
-            ready, held = _parted(events.select(~fewest))
-            before = ready.t[-1] if len(ready) else before
-            yield from _unless_empty(ready)
+            row, rows = rows, rows + len(events)
+            if not (isinstance(chunk, Events) and _is_right(events, last, height, width)):
+                first, error = _first_error(chunk, path, last, height, width, place, row)
+                bad = _known(chunk) | _outside(events, height, width)
+                wrong, fewest = _fewest(held, events, bad, before)
+                count = int(wrong.sum() + fewest.sum())
+                if strict or dropped + count > MAX_BAD_SHARE * rows:
+                    yield from _unless_empty(held)
+                    if first:  # so that a caller who stops before the damage never meets it
+                        yield events.select(slice(first))
+                    dropped = 0  # the error already says it
+                    raise error
+                first_error, dropped = first_error or error, dropped + count
+                held = held.select(~wrong) if wrong.any() else held
+                events = events.select(~fewest)
+            ready, later = _parted(events)
+            for part in filter(len, (held, ready)):
+                before = part.t[-1]
+                yield part
+            held = later
         yield from _unless_empty(held)
     finally:
         if dropped:
