@@ -32,7 +32,7 @@ from firenet_jax.evaluation.methods import Missing, filtered, load, recurrent_un
 from firenet_jax.evaluation.protocol import CUTS, displacement, plan
 from firenet_jax.evaluation.report import METRICS, _best, notes
 from firenet_jax.evaluation.report import steps as ticks_of
-from firenet_jax.events import Events
+from firenet_jax.events import Events, concatenate
 from firenet_jax.instants import steps
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.readers import open_recording
@@ -103,7 +103,7 @@ def direct(folder, name, sequence):
     recording = open_recording(folder / "data" / f"{sequence}.h5")
     found = load(["firenet", "e2vid", "hf", "mr"], [folder / "ours.npz"], e2vid_random=True)
     method = next(method for method in found if method.name == name)
-    (events,) = recording.events()
+    events = concatenate([*recording.events()])
     state, images = method.initial(HEIGHT, WIDTH), []
     times = recording.frames.times
     for number in range(1, len(times)):
@@ -244,7 +244,7 @@ def test_the_pages_events_are_those_before_its_frames(folder, evaluated):
         chosen, plan("data-a", recording, chosen.protocol), [("data-a", name) for name in NAMES]
     )
     assert shown.titles == ["events", "frame", *NAMES] and len(shown.stills) == 3
-    (events,) = recording.events()
+    events = concatenate([*recording.events()])
     for time, images in shown.stills:
         end = round(1e6 * float(time.removesuffix(" s")))
         votes = np.zeros((HEIGHT, WIDTH), int)
@@ -411,7 +411,7 @@ def test_a_filter_of_single_events_looks_at_those_since_its_last_window(folder):
     """So its images are of all events up to the time, whatever the windows that it took in."""
     hf = filtered("hf", HighPass(adaptive_range=False))
     recording = open_recording(folder / "data" / "a.h5")
-    (events,) = recording.events()
+    events = concatenate([*recording.events()])
     wanted = np.array([30_000, 31_000, 90_000])
     for count in (300, 4000):
         before = last = hf.initial(HEIGHT, WIDTH)
