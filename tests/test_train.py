@@ -199,6 +199,18 @@ def test_nothing_that_a_compiled_step_depends_on_is_a_path(tmp_path):
     assert not any(isinstance(leaf, Path) for leaf in leaves(tiny(tmp_path).step_settings))
 
 
+def simulated_steps(asked, key, textures, count):
+    """Tensors of the first steps, and which states were warm before each."""
+    make = jax.jit(partial(train_steps._simulated, settings=asked.step_settings))
+    state, seen, warm = first_state(asked), [], []
+    for step in range(count):
+        data, carried, known = make(key, textures, state=state._replace(step=jnp.int32(step)))
+        state = state._replace(carried=carried)
+        seen.append(data.tensors)
+        warm.append(known.tolist())
+    return seen, warm
+
+
 @pytest.mark.slow
 @pytest.mark.optimised
 def test_sequences_of_a_batch_are_of_different_ages_and_go_on_where_they_were(tmp_path):
@@ -208,13 +220,7 @@ def test_sequences_of_a_batch_are_of_different_ages_and_go_on_where_they_were(tm
     lengths = train_steps._lengths(settings)
     assert lengths.tolist() == [2, 4]
 
-    make = jax.jit(partial(train_steps._simulated, settings=settings))
-    state, seen, warm = first_state(asked), [], []
-    for step in range(4):
-        data, carried, known = make(key, textures, state=state._replace(step=jnp.int32(step)))
-        state = state._replace(carried=carried)
-        seen.append(data.tensors)
-        warm.append(known.tolist())
+    seen, warm = simulated_steps(asked, key, textures, 4)
     assert warm == [[False, False], [True, True], [False, True], [True, True]]
 
     def whole(number, windows):
@@ -238,13 +244,7 @@ def test_sequences_of_a_batch_are_of_different_ages_and_go_on_where_they_were(tm
 def test_sequences_to_and_fro_are_the_same_windows_in_every_step(tmp_path):
     asked = tiny(tmp_path, chain=4, windows=6, to_and_fro=1.0, loss=Loss(l0=2))
     textures, key = jnp.asarray(load_textures(None, 4, 64, 0, procedural=1.0)), jax.random.key(1)
-    make = jax.jit(partial(train_steps._simulated, settings=asked.step_settings))
-    state, seen, warm = first_state(asked), [], []
-    for step in range(3):
-        data, carried, known = make(key, textures, state=state._replace(step=jnp.int32(step)))
-        state = state._replace(carried=carried)
-        seen.append(data.tensors)
-        warm.append(known.tolist())
+    seen, warm = simulated_steps(asked, key, textures, 3)
     assert warm == [[False, False], [True, True], [False, True]]  # lengths are 2 and 4
     for now in seen:
         np.testing.assert_array_equal(now[3:], -now[2::-1, ..., ::-1])

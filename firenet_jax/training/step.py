@@ -193,8 +193,6 @@ def _simulated(
     numbers, parts = step // lengths, step % lengths
     sensors, scenes, durations = _setups(key, textures, settings, lengths, numbers)
     returns = _going_to_and_fro(key, settings, numbers)  # each of their steps is the first again
-    if state is None:  # validation is the same with and without
-        returns = jnp.zeros_like(returns)
     simulated = jnp.where(returns, 0, parts)
     bounds = window_bounds(durations, settings.windows, simulated * settings.windows)
     carried = state.carried if state is not None and chained else None
@@ -207,7 +205,7 @@ def _simulated(
             remembered = jax.tree.map(partial(choose, parts > 0), carried[1], remembered)
         size = {"height": settings.crop, "width": settings.crop}
         seen, data = simulate(sensors, scenes, bounds, seen, renderings=settings.renderings, **size)
-        if settings.to_and_fro:
+        if settings.to_and_fro and state is not None:  # validation is the same with and without
             choose = jax.vmap(partial(jnp.where), (0, 1, 1), 1)
             data = jax.tree.map(
                 partial(choose, returns), to_and_fro(data, scenes, bounds, **size), data
