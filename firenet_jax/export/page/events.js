@@ -107,31 +107,37 @@ function fromColumns(columns, name) {
   return checked({ t, x: columns.x.data, y: columns.y.data, p: columns.p.data, width, height }, name);
 }
 
-/** Lines `t x y p`, perhaps after a line `width height` or one of names. */
+/** Lines `t x y p`, perhaps after a line `width height` or one of names. Times with a decimal point
+ * or an exponent are seconds. */
 function fromText(bytes, name) {
   const lines = new TextDecoder().decode(bytes).split("\n");
-  const words = (line) => line.trim().split(/[\s,;]+/);
-  let [first, width, height, order] = [0, 0, 0, [0, 1, 2, 3]];
+  const words = (line) => line.trim().split(/\s*,\s*|[\s;]+/);
+  const number = (word) => { // False and True are 0 and 1
+    const value = Number(word || NaN);
+    return Number.isNaN(value) && /^(false|true)$/i.test(word) ? Number(word.length === 4) : value;
+  };
+  let [first, width, height, order, columns] = [0, 0, 0, [0, 1, 2, 3], 4];
   for (; first < lines.length; first++) {
     const found = words(lines[first]);
+    const named = words(lines[first].replace(/^[#%\s]+/, "")).map((word) => column(word.toLowerCase()));
     if (found.length === 2 && found.every((word) => /^\d+$/.test(word))) [width, height] = found.map(Number);
-    else if (/[a-z]/i.test(found[0]) && found.length >= 4) {
-      const named = found.map((word) => column(word.toLowerCase()));
+    else if ([..."txyp"].every((key) => named.includes(key))) {
       order = [..."txyp"].map((key) => named.indexOf(key));
-      if (order.includes(-1)) throw new Error(`${name}: expected columns t, x, y and p, found ${found}`);
-    } else if (found.length >= 4) break;
-    else if (found[0] && !found[0].startsWith("%") && !found[0].startsWith("#"))
-      throw new Error(`${name}, line ${first + 1}: expected t x y p, found ${found.slice(0, 6)}`);
+      columns = named.length;
+    } else if (/^[#%]|^$/.test(found[0])) continue;
+    else if (found.length >= 4 && !Number.isNaN(number(found[0]))) break;
+    else throw new Error(`${name}, line ${first + 1}: expected t x y p, found ${found.slice(0, 6)}`);
   }
-  const seconds = lines.slice(first, first + 1000).some((line) => words(line)[order[0]]?.includes("."));
+  const seconds = lines.slice(first, first + 1000).some((line) => /[.e]/i.test(words(line)[order[0]]));
   const rows = lines.length - first;
   const made = { t: new Float64Array(rows), x: new Float64Array(rows), y: new Float64Array(rows), p: new Float64Array(rows) };
   let count = 0;
   for (let n = first; n < lines.length; n++) {
     const found = words(lines[n]);
     if (!found[0]) continue;
-    const [t, x, y, p] = order.map((k) => Number(found[k]));
-    if (Number.isNaN(t + x + y + p)) throw new Error(`${name}, line ${n + 1}: expected t x y p, found ${found.slice(0, 6)}`);
+    const [t, x, y, p] = order.map((k) => number(found[k]));
+    if (found.length !== columns || Number.isNaN(t + x + y + p))
+      throw new Error(`${name}, line ${n + 1}: expected t x y p, found ${found.slice(0, 6)}`);
     made.t[count] = Math.round(seconds ? t * 1e6 : t);
     [made.x[count], made.y[count], made.p[count++]] = [x, y, p];
   }
