@@ -269,6 +269,15 @@ def test_frozen_blocks_keep_the_weights_they_start_from(tmp_path):
         same = jax.tree.map(lambda a, b: bool((a == b).all()), block, state.params[name])
         assert all(jax.tree.leaves(same)) == (name in ("gru2", "head")), name
 
+    def gradients(settings):
+        energy = partial(train_steps.loss_of, settings=settings.step_settings)
+        return jax.jit(jax.grad(lambda p: energy(p, data, None, False)[0]))(state.params)
+
+    ours, all_of_them = gradients(settings), gradients(replace(settings, frozen=()))
+    still = {name: jax.tree.map(jnp.zeros_like, ours[name]) for name in ("gru2", "head")}
+    expected = all_of_them | still  # the others learn what they would
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6), ours, expected)
+
 
 @pytest.mark.slow
 def test_remat_and_bfloat16_change_little(tmp_path):

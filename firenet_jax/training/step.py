@@ -266,6 +266,8 @@ def near_events(tensors: jax.Array) -> jax.Array:
 
 def loss_of(params, data: Simulation, state: State | None, warm, settings: StepSettings):
     """(loss, (its terms, last state, images)) of all devices' sequences."""
+    # Of blocks that stay as they are no gradient is computed, nor of what comes before them alone.
+    params = params | {k: jax.lax.stop_gradient(params[k]) for k in settings.frozen}
 
     def one_device(params, data, state, warm):
         last, images = images_of(params, data.tensors, settings, state)
