@@ -1,7 +1,7 @@
 """The run that made the built-in weights, `firenet_jax/weights/firenet.npz`.
 
-    python experiments/train_default.py RUN --images PICTURES      28 hours on two cores
-    python experiments/train_default.py RUN --report-only          what it was and how it went
+    python experiments/train_default.py RUN --images PICTURES   32 hours, two cores, and a GPU
+    python experiments/train_default.py RUN --report-only       what it was and how it went
 
 Stages, each in a folder of its own under RUN and from the last weights of the one before; an
 interrupted one goes on where it was. First clean sensors and windows in which much moves, because
@@ -12,8 +12,10 @@ blank grounds, uneven thresholds and what passes within one window, to teach it 
 passed; then the usual motion and faults again; then other pictures, most of them photographs of
 everyday things; rare motion, much slower and much faster, and noise that alternates as that of real
 sensors does; then detail where next to nothing moves; then sequences of hundreds of
-windows; then windows of any density, and noise alone; at last specialists, of which a mean is made.
-Each was a lesson of the one before.
+windows; then windows of any density, and noise alone; then specialists, of which a mean is made;
+then noise as it is in the dark; everything at once in large batches on a GPU; and at last, with the
+memory of what that began from, what makes pictures of the state. Each was a lesson of the one
+before.
 
 PICTURES were 63: scikit-image's own (`textures.PHOTOGRAPHS`), matplotlib's sample data, and those
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
@@ -42,9 +44,9 @@ material-kit(-react), now-ui-kit, paper-kit-2, shards-ui, soft-ui-design-system,
 startbootstrap-agency, -business-casual, -clean-blog, -creative, -landing-page, -one-page-wonder and
 -stylish-portfolio, stisla, @tabler/preview, tracking, uikit and @vladmandic/face-api, and of
 foolbox, gradio, imgaug, mahotas, scikit-image and thumbor; of stellarium-data's nebulae one in six.
-"clear" had 910, "bare" and those after it 873 to 878, of the same packages. "vast" had 1,122
-of packages named here, shrunk to 384 pixels on the shorter side. No picture of `textures.HELD_OUT`
-was among any of them.
+"clear" had 910, "bare" and those after it 873 to 878, of the same packages. "vast" and those
+after it had 1,122 of packages named here, shrunk to 384 pixels on the shorter side. No picture of
+`textures.HELD_OUT` was among any of them.
 
 Built in is RUN/weights.npz, a mean of the last weights of stages (Wortsman et al., "Model soups",
 ICML 2022); several stages began from such a mean. What was averaged was chosen by the sequences of
@@ -53,7 +55,8 @@ the reference of L, so that it mostly alternated; since then it alternates. Up t
 for good had no noise of its own (`curricula.AT_REST`).
 
 The report is written to results/train_default.json, the curve to results/train_default.png. Stages
-that are not in RUN, because they ran elsewhere, keep what was reported of them.
+that are not in RUN, because they ran elsewhere, keep what was reported of them; of "dusk" to "vast"
+nothing was, but the steps.
 """
 
 import json
@@ -505,8 +508,8 @@ BARING = replace(
     scene=replace(BARE.scene, halt=0.2, pause=0.1),
     sensor=replace(BARE.sensor, clean=0.75),
 )
-# Tried since; in no stage and no mean yet, their last weights are in results/stages/: detail in
-# dense windows, which can be learnt at the price of contrast, from the mean of "baring" and
+# Five that are in no stage and no mean; their last weights are in results/stages/. Detail in dense
+# windows, which can be learnt at the price of contrast, from the mean of "baring" and
 # HARDIER; and contrast again, from "keen".
 KEEN = replace(
     BARE,
@@ -557,7 +560,7 @@ SERENE = replace(
     scene=replace(BARE.scene, pause=0.1, halt=0.2),
     sensor=replace(BARE.sensor, clean=0.7),
 )
-# From what is built in. The same little flicker without losing memory: sequences of up to 400
+# From RESTING. The same little flicker without losing memory: sequences of up to 400
 # windows keep it, but contrast is lost all the same.
 ABIDING = replace(
     CLEAR,
@@ -572,7 +575,7 @@ ABIDING = replace(
     scene=replace(CLEAR.scene, halt=0.35),
     sensor=replace(CLEAR.sensor, clean=0.55),
 )
-# From what is built in. First windows above all, mostly faulty: less error on the card and against
+# From RESTING. First windows above all, mostly faulty: less error on the card and against
 # cameras' frames, which begin with nothing seen; but what it has seen does not last.
 WAKING = replace(
     CLEAR,
@@ -596,7 +599,7 @@ WAKING = replace(
     scene=replace(CLEAR.scene, pause=0.1, halt=0.1),
     sensor=replace(CLEAR.sensor, clean=0.25),
 )
-# From what is built in: noise that shows what is dark, as that of real sensors does, and a camera
+# From RESTING: noise that shows what is dark, as that of real sensors does, and a camera
 # that shakes. Less error against cameras' frames and more contrast, at the price of memory. (Here
 # and in "night" darkness of noise at rest was drawn from 0.02 to 0.5.)
 DUSK = replace(
@@ -614,7 +617,7 @@ DUSK = replace(
     scene=replace(CLEAR.scene, halt=0.35, still=0.12, shake=0.4),
     sensor=replace(CLEAR.sensor, clean=0.4, noise=(3e-3, 40.0), noise_in_light=(0.01, 0.5)),
 )
-# From half of that and half of what is built in, without the shake: memory comes back, and lasts
+# From half of that and half of RESTING, without the shake: memory comes back, and lasts
 # longer than before; in much noise that is equal everywhere images sink to black again.
 NIGHT = replace(
     DUSK,
@@ -625,7 +628,7 @@ NIGHT = replace(
     scene=replace(CLEAR.scene, halt=0.45, still=0.1),
     sensor=replace(DUSK.sensor, clean=0.42, noise=(3e-3, 30.0)),
 )
-# From what is built in, without the shake from the start: the least error of all against cameras'
+# From RESTING, without the shake from the start: the least error of all against cameras'
 # frames, but what it has seen lasts no longer.
 GLOAMING = replace(
     NIGHT,
@@ -647,11 +650,12 @@ DAWN = replace(
 )
 # On a GPU, an NVIDIA H200, in 400 seconds: eight times the sequences of a step, 40 windows in place
 # of 20, and everything that the stages before were for; its rate followed the clock. From a sixth
-# of "dawn", a quarter each of "night" and "gloaming" and a third of what is built in. Pictures of
+# of "dawn", a quarter each of "night" and "gloaming" and a third of RESTING. Pictures of
 # simulated scenes and cameras' frames are better than ever, and it rests; but a recording that is
-# played to and fro sinks to dark. That memory is in the second ConvGRU: with that of the mean which
-# it began from, what comes back stays, and half of the gain is lost. (Windows played to and fro in
-# two to five tenths of the sequences, four in a step on a CPU, brought memory and took pictures.)
+# played to and fro sinks to dark. What remembers is the candidate of the second ConvGRU, above all
+# its part for the state: with that of the mean which it began from, what comes back stays, and
+# everything rests better than with either. (Windows played to and fro in two to five tenths of the
+# sequences, four in a step on a CPU, brought memory and took pictures.)
 VAST = replace(
     CLEAR,
     steps=1446,
@@ -675,6 +679,25 @@ VAST = replace(
     scene=replace(CLEAR.scene, halt=0.35, still=0.08, shake=0.12),
     sensor=replace(CLEAR.sensor, clean=0.5, noise=(3e-3, 30.0), noise_in_light=(0.01, 0.5)),
 )
+# What follows the second ConvGRU, and nothing before it, so that what remembers stays as it is: two
+# runs, side by side, each from "vast" with another share of the memory of what that began from
+# (`REMEMBERED`), give pictures back what this had taken.
+LUCID = replace(
+    CLEAR,
+    steps=1000,
+    motion=(1.0, 24.0),
+    slow=0.12,
+    to_and_fro=0.3,
+    learning_rate=8e-4,
+    warmup=20,
+    frozen=("head", "gru1", "res1", "gru2"),
+    seed=451,
+    validate_every=100,
+    loss=replace(VAST.loss, L=CLEAR.loss.L, lambda_tc=9.0),
+    scene=replace(CLEAR.scene, halt=0.35, still=0.1, shake=0.06),
+    sensor=VAST.sensor,
+)
+LIMPID = replace(LUCID, seed=452)
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
@@ -709,6 +732,13 @@ STAGES = {
     "seasoned": (SEASONED, None),
     "lasting": (LASTING, None),
     "baring": (BARING, None),
+    "dusk": (DUSK, None),
+    "night": (NIGHT, None),
+    "gloaming": (GLOAMING, None),
+    "dawn": (DAWN, None),
+    "vast": (VAST, None),
+    "lucid": (LUCID, None),
+    "limpid": (LIMPID, None),
 }
 # Parts of a mean: what a stage starts from, if not from the one before.
 FIRST = {"even": 1, "usual": 1, "settle": 1, "natural": 9}
@@ -743,10 +773,37 @@ MEANS = {
     "baring": {name: 3 * part for name, part in HARDIER.items()}
     | {"settled": 128, "seasoned": 128},
 }
-# What is built in: seven tenths are what was before these last stages; "lasting" keeps brightness
-# in much noise, and a little of "baring" gives back in pictures what that takes. More of "baring"
-# is better in dense windows, and remembers less in recordings that go to and fro.
-SHIPPED = HARDIER | {"lasting": 66, "baring": 44}
+# Seven tenths are what was before these two stages; "lasting" keeps brightness in much noise, and a
+# little of "baring" gives back in pictures what that takes. More of "baring" is better in dense
+# windows, and remembers less in recordings that go to and fro.
+RESTING = HARDIER | {"lasting": 66, "baring": 44}
+
+
+def mixed(*parts: tuple[dict[str, float], float]) -> dict[str, float]:
+    """(a mean, its share) and more of these -> the mean of all, by stages."""
+    shares: dict[str, float] = {}
+    for mean, share in parts:
+        for name, part in mean.items():
+            shares[name] = shares.get(name, 0.0) + share * part / sum(mean.values())
+    return shares
+
+
+DUSKY = mixed(({"night": 3, "gloaming": 3, "dawn": 2}, 2), (RESTING, 1))
+MEANS |= {
+    "dusk": RESTING,
+    "night": mixed(({"dusk": 1}, 1), (RESTING, 1)),
+    "gloaming": RESTING,
+    "dawn": {"night": 1, "gloaming": 1},
+    "vast": DUSKY,
+    "lucid": {"vast": 1},
+    "limpid": {"vast": 1},
+}
+# What is built in.
+SHIPPED = {"lucid": 1, "limpid": 1}
+# The candidate of the second ConvGRU is that of "vast", with this share of that of DUSKY, which
+# "vast" began from. More of it remembers better what goes to and fro, and rests less well; with .6
+# pictures are best.
+REMEMBERED = {"lucid": 1.0, "limpid": 0.6, "shipped": 0.6}
 # For the last bias of what "ages" began from: on pictures of the pool, images were darker than
 # truth, by 0.05. What was made of it since is trained.
 LIFTS = {"ages": 0.03}
@@ -758,12 +815,27 @@ def train(folder: Path, images: Path) -> None:
         if name in MEANS:
             path = folder / f"before_{name}.npz"
             weights = average(folder, MEANS[name], path, LIFTS.get(name, 0.0))
+        if name in REMEMBERED:
+            weights = remembering(folder, weights, REMEMBERED[name])
         run(replace(settings, output=folder / name, images=images, weights=weights), stop)
         weights = folder / name / "last.npz"
-    average(folder, SHIPPED, folder / "weights.npz")
+    remembering(folder, average(folder, SHIPPED, folder / "weights.npz"), REMEMBERED["shipped"])
 
 
-def average(folder: Path, parts: dict[str, int], path: Path, lift: float = 0.0) -> Path:
+def remembering(folder: Path, path: Path, share: float) -> Path:
+    """Gives the weights at `path` the memory of "vast", with this share of that of DUSKY."""
+    weights = load_weights(path)
+    vast = load_weights(folder / "vast" / "last.npz").params["gru2"]
+    dusky = load_weights(average(folder, DUSKY, folder / "dusky.npz")).params["gru2"]
+    candidate = jax.tree.map(
+        lambda a, b: (1 - share) * a + share * b, vast["candidate"], dusky["candidate"]
+    )
+    gru2 = weights.params["gru2"] | {"candidate": candidate}
+    save_weights(path, replace(weights, params=weights.params | {"gru2": gru2}))
+    return path
+
+
+def average(folder: Path, parts: dict[str, float], path: Path, lift: float = 0.0) -> Path:
     """Writes a mean of the last weights of these stages, its images brighter by `lift`."""
     each = [load_weights(folder / name / "last.npz") for name in parts]
     shares = [part / sum(parts.values()) for part in parts.values()]
@@ -800,13 +872,15 @@ def record(folder: Path) -> dict:
 def report(folder: Path) -> None:
     last = RESULTS / "train_default.json"
     stages = json.loads(last.read_text())["stages"] if last.exists() else {}
-    done, seconds = 0, 0.0
+    done, seconds, lost = 0, 0.0, {}
     figure, axes = plt.subplots(figsize=(7, 3.5), layout="constrained")
     for name in STAGES:
         if (folder / name).is_dir():  # else it ran elsewhere, and was reported there
             stages[name] = record(folder / name)
         if name not in stages:
-            print(f"{name}: left out, as there is neither its folder nor a record of it")
+            settings, stop = STAGES[name]
+            lost[name] = stop or settings.steps
+            print(f"{name}: not drawn, as there is neither its folder nor a record of it")
             continue
         validations = stages[name]["validations"]
         steps = [done + entry["step"] for entry in validations]
@@ -816,7 +890,8 @@ def report(folder: Path) -> None:
     figure.legend(loc="outside right upper", fontsize=7)
     axes.grid(alpha=0.3)
     figure.savefig(RESULTS / "train_default.png", dpi=100)
-    save("train_default", {"steps": done, "hours": seconds / 3600, "stages": stages})
+    whole = {"steps": done, "hours": seconds / 3600, "steps_without_a_record": lost}
+    save("train_default", whole | {"stages": stages})
 
 
 def main(folder: tyro.conf.Positional[Path], images: Path | None = None, report_only: bool = False):
