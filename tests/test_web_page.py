@@ -109,6 +109,7 @@ TEXTS = {
     "savetxt.txt": "1.000000000000000021e-03 3.000e+00 4.000e+00 1.000e+00\n2.5e-3 9 5 0\n",
     "logical.txt": "40 30\n0.001 3 4 True\n0.0025 9 5 False\n",
     "order.csv": "p, x, y, t, more\nTrue, 3, 4, 0.001, 7\nFalse, 9, 5, 0.0025, 8\n",
+    "whole.csv": "p,x,y,t\n1,3,4,1000\n0,9,5,2500\n\n",
     "names.txt": "# t x y p\n1000 3 4 +1\n2500 9 5 -1\n",
     "windows.txt": "\ufeff% made elsewhere\r\n1000\t3\t4\t1\r\n2500\t9\t5\t0",
     "exponent.txt": "1e-3 3 4 1\n25e-4 9 5 0\n",

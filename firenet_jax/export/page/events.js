@@ -128,7 +128,7 @@ function fromText(bytes, name) {
     else if (found.length >= 4 && !Number.isNaN(number(found[0]))) break;
     else throw new Error(`${name}, line ${first + 1}: expected t x y p, found ${found.slice(0, 6)}`);
   }
-  const seconds = lines.slice(first, first + 1000).some((line) => /[.e]/i.test(words(line)[order[0]]));
+  const seconds = lines.slice(first, first + 1000).some((line) => /[.e]/i.test(words(line)[order[0]] ?? ""));
   const rows = lines.length - first;
   const made = { t: new Float64Array(rows), x: new Float64Array(rows), y: new Float64Array(rows), p: new Float64Array(rows) };
   let count = 0;
