@@ -241,6 +241,12 @@ def test_text_with_polarities_of_other_words(tmp_path, monkeypatch, order, off, 
     refused(path, f"line 7: the polarity is yes, expected {expected}")
 
 
+@pytest.mark.parametrize("word", ["+-1", "++1", "+"])
+def test_a_number_has_one_sign(tmp_path, word):
+    path = write(tmp_path / "a.txt", f"0.1 1 2 +1\n0.2 1 2 -1\n0.3 1 2 {word}\n")
+    refused(path, f"line 3: the polarity is {word}, expected 0 or 1")
+
+
 @pytest.mark.parametrize("size", ["0 0", "320 0", "999999 180"])
 def test_a_sensor_that_cannot_be_is_refused(tmp_path, size):
     said = "states a sensor of " + size.replace(" ", "x")
@@ -577,6 +583,10 @@ def test_wrong_pictures_of_mvsec(tmp_path):
     ):
         refused(write_mvsec(path, image_raw=image_raw, image_raw_ts=times), f"{said}")
     refused(write_mvsec(path, image_raw=pictures), "davis/left/image_raw_ts is missing: expected")
+    for group in ("image_raw", "image_raw_ts"):
+        arrays = {"image_raw": pictures, "image_raw_ts": [0.1, 0.2], f"{group}/a": 1}
+        del arrays[group]
+        refused(write_mvsec(path, **arrays), f"davis/left/{group} is a group, expected an array")
 
 
 def test_pictures_of_hdf5_are_in_the_order_of_their_numbers(tmp_path):

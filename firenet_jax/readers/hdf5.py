@@ -214,6 +214,9 @@ def in_order(names: Iterable[str]) -> list[str]:
 
 def _mvsec_frames(path: Path, left: Any) -> Frames | None:
     pictures, times = left.get("image_raw"), left.get("image_raw_ts")
+    for name, array in {"image_raw": pictures, "image_raw_ts": times}.items():
+        if isinstance(array, h5py.Group):
+            raise RecordingError(f"{path}: {MVSEC}/{name} is a group, expected an array")
     if pictures is None or pictures.shape[:1] == (0,):
         return None
     if times is None:

@@ -361,9 +361,10 @@ def _tidied(block: bytes, separator: str) -> bytes:
         block = block.replace(b"  ", b" ")
     block = block.replace(b"\n ", b"\n").replace(b" \n", b"\n").strip(b" ")
     block = block.replace(b", ", b",").replace(b" ,", b",")  # pyarrow trims numbers, not True
-    for before in (b" ", b",", b"\n"):
-        block = block.replace(before + b"+", before)
-    block = block.removeprefix(b"+")
+    if b"+-" not in block:  # no number, and would become one
+        for before in (b" ", b",", b"\n"):
+            block = block.replace(before + b"+", before)
+        block = block.removeprefix(b"+")
     return block if separator == "," else block.replace(b" ", separator.encode())
 
 
