@@ -16,7 +16,7 @@ from test_cli import firenet
 from test_pipeline import write_recording
 
 from firenet_jax.commands.export import Export, run, simulated
-from firenet_jax.events import Events
+from firenet_jax.events import Events, concatenate
 from firenet_jax.export.web_page import FILES
 from firenet_jax.readers import open_recording
 from firenet_jax.storage.sequence_file import Picture, write_sequence
@@ -148,8 +148,8 @@ def test_text_is_read_by_the_page_as_by_the_package(tmp_path, monkeypatch):
     found = read_by_the_page(*TEXTS)
     for name in TEXTS:
         recording = open_recording(Path(name))
-        chunks = [(e.t, e.x, e.y, e.p) for e in recording.events()]
-        columns = [np.concatenate(c).astype(int).tolist() for c in zip(*chunks, strict=True)]
+        events = concatenate([*recording.events()])
+        columns = [c.astype(int).tolist() for c in (events.t, events.x, events.y, events.p)]
         assert found[name] == [recording.width, recording.height, *columns], name
     assert found["savetxt.txt"][2] == [1000, 2500]  # and so for both
 

@@ -266,7 +266,7 @@ def near_events(tensors: jax.Array) -> jax.Array:
 
 def loss_of(params, data: Simulation, state: State | None, warm, settings: StepSettings):
     """(loss, (its terms, last state, images)) of all devices' sequences."""
-    # Of blocks that stay as they are no gradient is computed, nor of what comes before them alone.
+    # Frozen blocks have a gradient of zero: it is not computed, and no optimiser moves them by it.
     params = params | {k: jax.lax.stop_gradient(params[k]) for k in settings.frozen}
 
     def one_device(params, data, state, warm):
@@ -295,8 +295,6 @@ def _updated(
     both = jax.value_and_grad(loss_of, has_aux=True)
     (loss, (terms, last, _)), gradient = both(state.params, data, before, warm, settings)
     updates, optimised = optimiser(settings).update(gradient, state.optimiser, state.params)
-    blocks = cast(dict[str, Any], updates)
-    updates = blocks | {k: jax.tree.map(jnp.zeros_like, blocks[k]) for k in settings.frozen}
     params = optax.apply_updates(state.params, updates)
     terms = {"loss": loss, "gradient": optax.tree.norm(gradient), **terms}
     return state._replace(params=params, optimiser=optimised, step=state.step + 1), terms, last
