@@ -8,7 +8,7 @@ FROM python:3.13-slim
 COPY dist/firenet_jax-*.whl /tmp/
 RUN pip install --no-cache-dir "$(ls -t /tmp/firenet_jax-*.whl | head -1)[formats]" && rm /tmp/firenet_jax-*.whl
 
-# What is written belongs to nobody's root; name yourself with --user "$(id -u):$(id -g)".
+# It runs as an unprivileged user. To own the files that it writes, add --user "$(id -u):$(id -g)".
 RUN useradd --create-home firenet
 USER firenet
 WORKDIR /data

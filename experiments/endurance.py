@@ -375,7 +375,7 @@ def frames(methods: Methods, recordings: list[Path]) -> list[dict]:
         recording = fj.open_recording(path)
         stamps = recording.frames.times
         truths = [np.float32(recording.frames.read(k)) / 255 for k in range(len(stamps))]
-        windows = partial(fj.event_tensors, recording, chunk=1, between_frames=True)
+        windows = partial(fj.event_tensors, recording, chunk=1, frame_to_frame=True)
         first = [tensors for tensors, _ in itertools.islice(windows(), WARM_UP)]
         states = {}
         for name, weights in methods.items():

@@ -39,7 +39,7 @@ def main():
     rows, numbers = [], []
     for sequence in conditions(options):
         recording = sequence.recording
-        windows = windows_of(sequence, Windows(between_frames=True))
+        windows = windows_of(sequence, Windows(frame_to_frame=True))
         made = [last_image(method, windows, recording) for method in methods.values()]
         truth = sequence.truth(windows[-1].time)
         for title, image in zip(methods, made, strict=True):

@@ -39,7 +39,7 @@ NAMES = ("ssim", "mse", "ssim_moving", "mse_moving", "ssim_moving_equalised",
 def of_windows(weights, recording, windows: Windows) -> dict[int, np.ndarray]:
     """Time of each window's end -> its image (H, W)."""
     state, found = fj.initial_state(1, recording.height, recording.width), {}
-    choices = {"between_frames": True} if windows.between_frames else {
+    choices = {"frame_to_frame": True} if windows.frame_to_frame else {
         "events_per_pixel": 0.35, "longest": windows.longest
     }  # fmt: skip
     for tensors, times in fj.event_tensors(recording, chunk=4, **choices):
@@ -87,7 +87,7 @@ def flicker(images: list[np.ndarray]) -> float:
 def of_frames(weights, recording, events, kept: dict) -> dict:
     """Both ways on the recording's frames; kept: the images at their times, which may be more."""
     times, shape = recording.frames.times, (recording.height, recording.width)
-    gaps = of_windows(weights, recording, Windows(between_frames=True))
+    gaps = of_windows(weights, recording, Windows(frame_to_frame=True))
     ends = np.array(sorted(gaps))  # of the last event before a frame
     rows = {"frame to frame": [], "at its time": []}
     for number, time in enumerate(times.tolist()):

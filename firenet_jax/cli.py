@@ -43,7 +43,7 @@ COMMANDS = {
     "export": (
         "firenet_jax.commands.export",
         "Export",
-        "weights -> ONNX, StableHLO, PyTorch, safetensors",
+        "weights -> ONNX, StableHLO, PyTorch, safetensors, a web page",
     ),
 }
 
@@ -84,7 +84,7 @@ def usage() -> str:
             *lines,
             "",
             "firenet COMMAND --help explains a command and gives examples. With FIRENET_DEBUG=1",
-            "in the environment, errors show a traceback.",
+            "in the environment, errors show a traceback. firenet --version prints the version.",
         ]
     )
 

@@ -143,7 +143,7 @@ def _in_order(times: Iterable[int]) -> Iterator[int]:
 
 def check(windows: Windows) -> None:
     """Raises SettingsError for windows that cannot be combined with images at given times."""
-    if windows.between_frames:
+    if windows.frame_to_frame:
         raise SettingsError("images at given times come of windows of a size, not between frames")
     if windows.step is not None:
         raise SettingsError("images at given times come of windows that do not overlap: no step")

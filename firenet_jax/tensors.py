@@ -247,7 +247,7 @@ def event_tensors(
     times: microseconds, that of each window's last event; for an empty window, its end.
     chunk: T. The last chunk may be shorter, which compiles your functions for that length too.
     windows: one of events_per_pixel=0.35 (the default), events (a number), duration (milliseconds)
-    or between_frames=True; see `windows.Windows` for more.
+    or frame_to_frame=True; see `windows.Windows` for more.
     Raises ValueError for invalid windows, RecordingError if the file is damaged.
     """
     if chunk < 1:

@@ -40,7 +40,7 @@ class Windows:
     """A window holds this many events per pixel of the sensor (default: 0.35)."""
     duration: Annotated[float | None, tyro.conf.arg(aliases=["-T"])] = None
     """A window lasts this many milliseconds, on a grid that starts at the first event."""
-    between_frames: Annotated[bool, tyro.conf.arg(name="frame-to-frame")] = False
+    frame_to_frame: bool = False
     """A window lasts from one of the camera's frames to the next."""
     step: float | None = None
     """Windows start this many events apart (milliseconds, with --duration). If this is less than
@@ -50,7 +50,7 @@ class Windows:
     chosen: 40, or a twentieth of a recording shorter than 0.8 s."""
 
     def __post_init__(self):
-        ways = [self.events, self.events_per_pixel, self.duration, self.between_frames or None]
+        ways = [self.events, self.events_per_pixel, self.duration, self.frame_to_frame or None]
         if sum(way is not None for way in ways) > 1:
             raise SettingsError(
                 "windows are cut in one way: choose one of --events, --events-per-pixel, "
@@ -63,7 +63,7 @@ class Windows:
                     f"{name} is {value}, but must be more than 0, at most {MAX_NUMBER}"
                 )
         if self.step is not None:
-            if self.between_frames:
+            if self.frame_to_frame:
                 raise SettingsError(
                     "step overlaps windows of a fixed size, not those between frames"
                 )
@@ -72,7 +72,7 @@ class Windows:
             if self.duration is not None and round(self.step * 1000) < 1:
                 raise SettingsError(f"step is {self.step} ms, but times are whole microseconds")
         if self.longest is not None:
-            if self.duration is not None or self.between_frames or self.step is not None:
+            if self.duration is not None or self.frame_to_frame or self.step is not None:
                 raise SettingsError("longest limits windows of events, which do not overlap")
             if round(self.longest * 1000) < 1:
                 raise SettingsError(
@@ -104,7 +104,7 @@ def usual(chunks: Iterable[Events]) -> Windows:
 def in_words(windows: Windows, pixels: int) -> str:
     """ "windows of 0.35 events per pixel (15,120), at most 40 ms" """
     count = windows.count(pixels)
-    if windows.between_frames:
+    if windows.frame_to_frame:
         said = "windows between frames"
     elif windows.duration is not None:
         said = f"windows of {windows.duration:g} ms"
@@ -132,7 +132,7 @@ def cut(
     longer than the window.
     """
     chunks = iter(recording.events() if chunks is None else chunks)
-    if windows.between_frames:
+    if windows.frame_to_frame:
         times = () if recording.frames is None else np.unique(recording.frames.times)
         if len(times) < 2:
             raise RecordingError(

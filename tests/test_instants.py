@@ -128,7 +128,7 @@ def test_damage_is_told_after_what_came_before_it(recording):
     assert len(kept) == 7 and len([s for s in found if s.time]) > 7
 
 
-@pytest.mark.parametrize("way", [{"between_frames": True}, {"events": 9, "step": 3}])
+@pytest.mark.parametrize("way", [{"frame_to_frame": True}, {"events": 9, "step": 3}])
 def test_windows_that_are_of_no_use_for_it(recording, way):
     with pytest.raises(ValueError, match="images at given times"):
         next(steps(recording, Windows(**way), [1]))
@@ -334,4 +334,4 @@ def test_impossible_choices(weights, recording):
     with pytest.raises(ValueError, match="warm_up is -1"):
         next(images_at(weights, recording, [1], warm_up=-1))
     with pytest.raises(ValueError, match="given times"):
-        next(images_at(weights, recording, [1], between_frames=True))
+        next(images_at(weights, recording, [1], frame_to_frame=True))

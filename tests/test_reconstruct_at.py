@@ -137,7 +137,7 @@ def test_times_outside_of_a_recording(tmp_path, weights, caplog):  # noqa: F811
 @pytest.mark.parametrize(
     "choice, said",
     [
-        ({"windows": Windows(between_frames=True)}, "not between frames"),
+        ({"windows": Windows(frame_to_frame=True)}, "not between frames"),
         ({"windows": Windows(events=9, step=3)}, "do not overlap"),
         ({"times": Times(), "names": "nanoseconds"}, "where it is chosen"),
         ({"topic": "a b"}, "topic is"),

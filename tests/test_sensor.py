@@ -298,9 +298,9 @@ def test_faults_are_switched_on_but_what_is_given_stays():
         ({"flicker": (0.0, 0.5)}, "flicker is 0 0.5"),
         ({"threshold": -1.0}, "threshold is -1"), ({"refractory": -1.0}, "refractory is -1"),
         ({"mismatch": np.nan}, "mismatch"),
-        ({"threshold": 0.3, "threshold_range": (0.1, 0.6)}, "pass --threshold-range None too"),
-        ({"threshold": 0.18, "threshold_range": (0.1, 0.6)}, "pass --threshold-range None too"),
-        ({"refractory": 5e-3, "refractory_range": (1e-4, 1e-3)}, "pass --refractory-range None"),
+        ({"threshold": 0.3, "threshold_range": (0.1, 0.6)}, "--threshold-range VALUE VALUE"),
+        ({"threshold": 0.18, "threshold_range": (0.1, 0.6)}, "--threshold-range VALUE VALUE"),
+        ({"refractory": 5e-3, "refractory_range": (1e-4, 1e-3)}, "--refractory-range VALUE VALUE"),
     ],
 )  # fmt: skip
 def test_impossible_sensors(choice, message):

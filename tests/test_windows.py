@@ -82,7 +82,7 @@ def test_by_duration_with_overlap():
 @pytest.mark.parametrize("chunk", [1, 4, 100])
 def test_between_frames(chunk):
     recording = recording_of(range(0, 100, 5), frames=[20, 30, 40, 60], chunk=chunk)
-    assert times_of(recording, between_frames=True) == [
+    assert times_of(recording, frame_to_frame=True) == [
         [0, 5], [10, 15],  # the clock runs back to the first event
         [20, 25], [30, 35], [40, 45, 50, 55],
         [60, 65], [70, 75], [80, 85], [90, 95],  # and on after the last frame
@@ -91,7 +91,7 @@ def test_between_frames(chunk):
 
 def test_between_frames_starts_with_the_first_event():
     recording = recording_of(range(31, 60), frames=[0, 10, 20, 30, 40, 50])
-    assert [w[0] for w in times_of(recording, between_frames=True)] == [31, 40, 50]
+    assert [w[0] for w in times_of(recording, frame_to_frame=True)] == [31, 40, 50]
 
 
 @pytest.mark.parametrize("duration", [33.3333, 16.6667, 8.3335])
@@ -103,13 +103,13 @@ def test_by_duration_leaves_no_gap_and_no_overlap(duration):
 
 def test_windows_in_time_from_where_one_says():
     recording = recording_of([25, 41], frames=[0, 10, 20, 30, 40])
-    windows = list(cut(recording, Windows(between_frames=True), begin=10))
+    windows = list(cut(recording, Windows(frame_to_frame=True), begin=10))
     assert [(w.time, len(w.events)) for w in windows] == [(20, 0), (25, 1), (40, 0), (41, 1)]
     windows = list(cut(recording, Windows(duration=0.01), begin=20))
     assert [(w.time, len(w.events)) for w in windows] == [(25, 1), (40, 0), (41, 1)]
 
 
-@pytest.mark.parametrize("windows", [{"duration": 10}, {"between_frames": True}])
+@pytest.mark.parametrize("windows", [{"duration": 10}, {"frame_to_frame": True}])
 def test_events_before_the_first_window_are_not_held(windows):
     """A thousand chunks of 13 kB lie before it, one after it."""
 
@@ -129,7 +129,7 @@ def test_events_before_the_first_window_are_not_held(windows):
     assert not list(cut(recording, Windows(**windows), begin=1_001_000))
 
 
-@pytest.mark.parametrize("windows", [{"duration": 10}, {"between_frames": True}])
+@pytest.mark.parametrize("windows", [{"duration": 10}, {"frame_to_frame": True}])
 def test_a_time_far_from_the_others_is_named_not_reached_window_by_window(windows):
     recording = recording_of([0, 100, 4 * 10**9], frames=[0, 100])
     found = cut(recording, Windows(**windows))
@@ -153,12 +153,12 @@ def test_an_hour_without_events_is_no_broken_time(gap, refused):
 def test_frames_on_another_clock_are_refused(frames, events):
     recording = recording_of(events + np.arange(20), frames=frames)
     with pytest.raises(RecordingError, match="memory: .*not on one clock"):
-        list(cut(recording, Windows(between_frames=True)))
+        list(cut(recording, Windows(frame_to_frame=True)))
 
 
 @pytest.mark.parametrize("after, refused", [(3_600_000_000, False), (3_600_000_001, True)])
 def test_an_hour_is_not_another_clock(after, refused):
-    found = cut(recording_of([0, 5], frames=[after, 2 * after]), Windows(between_frames=True))
+    found = cut(recording_of([0, 5], frames=[after, 2 * after]), Windows(frame_to_frame=True))
     if refused:
         with pytest.raises(RecordingError, match="not on one clock"):
             list(found)
@@ -168,12 +168,12 @@ def test_an_hour_is_not_another_clock(after, refused):
 
 def test_frames_all_at_one_time_are_too_few():
     with pytest.raises(RecordingError, match="each at a time of its own"):
-        cut(recording_of(range(20), frames=[5, 5, 5]), Windows(between_frames=True))
+        cut(recording_of(range(20), frames=[5, 5, 5]), Windows(frame_to_frame=True))
 
 
 def test_between_frames_needs_frames():
     with pytest.raises(RecordingError, match="two frames or more"):
-        cut(recording_of(range(9)), Windows(between_frames=True))
+        cut(recording_of(range(9)), Windows(frame_to_frame=True))
 
 
 def test_no_events_no_windows():
@@ -193,7 +193,7 @@ def test_no_events_no_windows():
         ({"duration": 0.0001}, "whole microseconds"),
         ({"duration": 5, "step": 0.0001}, "step is 0.0001 ms"),
         ({"events": 5, "step": 2.5}, "whole number"),
-        ({"between_frames": True, "step": 2}, "fixed size"),
+        ({"frame_to_frame": True, "step": 2}, "fixed size"),
     ],
 )
 def test_impossible_settings(fields, message):
@@ -229,7 +229,7 @@ def test_windows_far_larger_than_chunks_cost_linear_time():
 def test_after_the_last_frame_the_clock_goes_on_as_it_mostly_did():
     """One interval that is unlike the others, here the first, does not set the pace."""
     recording = recording_of(range(0, 60, 5), frames=[0, 3, 13, 23, 33])
-    assert times_of(recording, between_frames=True) == [
+    assert times_of(recording, frame_to_frame=True) == [
         [0], [5, 10], [15, 20], [25, 30], [35, 40], [45, 50], [55],
     ]  # fmt: skip
 
@@ -264,7 +264,7 @@ def test_what_is_usual_depends_on_how_long_a_recording_is(seconds, longest):
     )
 
 
-@pytest.mark.parametrize("other", [{"duration": 5.0}, {"between_frames": True}, {"step": 3}])
+@pytest.mark.parametrize("other", [{"duration": 5.0}, {"frame_to_frame": True}, {"step": 3}])
 def test_a_longest_window_is_one_of_events(other):
     with pytest.raises(ValueError, match="longest limits windows of events"):
         Windows(longest=40.0, **other)

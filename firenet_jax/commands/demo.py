@@ -39,7 +39,7 @@ CAPTION = 16  # pixels above the pictures
 
 @dataclass(frozen=True)
 class Demo:
-    """Simulate a moving scene and reconstruct it from its events: both side by side.
+    """Simulate a moving scene: its events, their reconstruction and the truth side by side.
 
     Examples:
       firenet demo -o demo.mp4

@@ -31,7 +31,7 @@ class Info:
     recording: tyro.conf.Positional[Path]
     """Text, zip, HDF5, ECD or EVREAL folder, .bin, .dat, .raw, .aedat, .aedat4, .es, ROS bag."""
     sensor_size: str | None = None
-    """WIDTHxHEIGHT of the sensor, where the recording does not say it."""
+    """WIDTHxHEIGHT of the sensor, where the recording does not state it."""
     columns: str | None = None
     """Order of the columns of a text that has no line of names, such as x,y,p,t."""
     strict: bool = False

@@ -254,7 +254,7 @@ def judged(weights: Weights, one: Cut, near: bool) -> Score:
     """
     times = one.frames.times
     first = int(np.searchsorted(times, times[one.end] - WARM_UP))
-    windows = cut(one.recording, Windows(between_frames=True), begin=int(times[first]))
+    windows = cut(one.recording, Windows(frame_to_frame=True), begin=int(times[first]))
     numbered = zip(range(first + 1, len(times)), windows, strict=False)
     state = initial_state(1, one.recording.height, one.recording.width)
     seen, scores, size = jnp.zeros((1, *state.g1.shape[:3]), bool), [], 0

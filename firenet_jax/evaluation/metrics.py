@@ -8,8 +8,8 @@ entries, (...,) float32.
     similarities, 1 if equal    ssim  ms_ssim  haarpsi  cw_ssim  equalised_ssim;   psnr is in dB
     without a ground truth      event_correlation
 
-gmsd, haarpsi, cw_ssim and detail are blind to a negative: used alone they accept pictures with
-inverted polarity. All gradients are finite, for equal, flat and zero images too.
+gmsd, haarpsi, cw_ssim and detail are invariant to inverted contrast: used alone they accept
+pictures with inverted polarity. All gradients are finite, for equal, flat and zero images too.
 
 Every linear filter here is separable and applied as two matrices that include borders and
 decimation: rows @ image @ columns.T. On XLA's CPU backend (40 images of 96x96, SSIM with its

@@ -74,7 +74,7 @@ class Protocol:
         """Raises SettingsError for invalid values."""
         if not 0 < self.keep_ratio <= 1:
             raise SettingsError(f"keep ratio is {self.keep_ratio}, but is a share, 0 to 1")
-        if self.keep_ratio < 1 and not self.windows.between_frames:
+        if self.keep_ratio < 1 and not self.windows.frame_to_frame:
             raise SettingsError(
                 "keep ratio thins out frames: it varies windows between frames only"
             )
@@ -104,7 +104,7 @@ class Protocol:
 
     def in_words(self) -> list[str]:
         """What is done, in sentences, for people who read a table."""
-        if self.windows.between_frames:
+        if self.windows.frame_to_frame:
             windows = "windows between frames"
         elif self.windows.events is not None:
             windows = f"windows of {self.windows.events} events"
@@ -116,8 +116,8 @@ class Protocol:
             )
         if self.images_at is not None:
             windows = (
-                f"{self.images_at}, each a look whose state is thrown away; the state by "
-                f"{windows} (hf and mr look at the events since)"
+                f"{self.images_at}, each from an extra step whose state is discarded; the state by "
+                f"{windows} (hf and mr process the events since their last update)"
             )
         if self.keep_ratio < 1:
             windows += f", {self.keep_ratio:g} of the frames kept (seed {self.seed})"

@@ -5,7 +5,7 @@
 
 float32, channels first, as PyTorch and ONNX have it. g1 and g2 are zeros before the first window,
 and then what the last step gave as g1_next and g2_next: in ONNX an input and an output cannot share
-a name. The picture is uint8, as `firenet reconstruct` shows it with nothing chosen.
+a name. The picture is uint8, as `firenet reconstruct --range fixed` shows it.
 
 Operators: onnx.ai/onnx/operators, opset 17 (2022), all of them also in the browsers' runtime.
 """
@@ -164,7 +164,7 @@ def _normalise(graph: _Graph, events: str) -> str:
 
 
 def _picture(graph: _Graph, image: str, out: str) -> str:
-    """`pictures.display` with its defaults: unsharp mask, clipped to 0..1, rounded to 8 bits."""
+    """`pictures.display` with a fixed range: unsharp mask, clipped to 0..1, rounded to 8 bits."""
     kernel = unsharp_kernel(Display().unsharp)[None, None]
     mask = graph.constant("unsharp", kernel)
     sharp = graph.add("Conv", image, mask, out="sharp", kernel_shape=[5, 5], pads=[2] * 4)

@@ -44,7 +44,7 @@ class SceneSettings:
     pause: float = 0.3
     """Probability that everything stands still for a while, in each half of the scene."""
     halt: float = 0.0
-    """Probability that everything stops for good in the first third of the scene, to teach the
+    """Probability that everything stops permanently in the first third of the scene, to teach the
     network to remember."""
     shake: float = 0.0
     """Probability that the camera trembles, as in a hand or on a machine: edges come and go by less

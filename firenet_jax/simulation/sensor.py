@@ -135,16 +135,17 @@ class SensorSettings:
             if value is not None and not (value >= 0 and math.isfinite(value)):
                 raise SettingsError(f"{name} is {value}, but must be 0 or more")
         # A range takes precedence, so the other value would silently be ignored.
-        for name, owner in (
-            ("threshold", "threshold_range"),
-            ("threshold_spread", "threshold_range"),
-            ("refractory", "refractory_range"),
+        for name, owner, remedy in (
+            ("threshold", "threshold_range", "for a fixed one pass --threshold-range VALUE VALUE"),
+            ("threshold_spread", "threshold_range", "pass --asymmetry"),
+            (
+                "refractory",
+                "refractory_range",
+                "for a fixed one pass --refractory-range VALUE VALUE",
+            ),
         ):
             if None not in (getattr(self, owner), getattr(self, name)):
-                raise SettingsError(
-                    f"{name} plays no part beside {owner}: "
-                    f"pass --{owner.replace('_', '-')} None too"
-                )
+                raise SettingsError(f"{name} has no effect beside {owner}: {remedy}")
 
 
 FAULTY = SensorSettings(
@@ -155,7 +156,7 @@ FAULTY = SensorSettings(
     hot=(1e-4, 1e-3),
     cutoff=(100.0, 1000.0),
 )
-"""All faults, as strong as in real sensors."""
+"""All faults except flicker, as strong as in real sensors."""
 
 
 def with_faults(sensor: SensorSettings) -> SensorSettings:

@@ -33,9 +33,9 @@ class Loss:
     """Mean absolute difference."""
     centred: float = 0.0
     """Mean absolute difference after subtracting each image's mean: events carry no absolute
-    brightness, so that most of the gradient of a difference of means is noise."""
+    brightness, so an offset is not penalised."""
     contrast: float = 0.0
-    """Difference of the standard deviations; blind to a negative."""
+    """Difference of the standard deviations; invariant to inverted contrast."""
     nlpd: float = 0.5
     """Normalised Laplacian pyramid distance."""
     ssim: float = 0.0
@@ -43,25 +43,26 @@ class Loss:
     ms_ssim: float = 0.0
     """1 - MS-SSIM."""
     gmsd: float = 0.0
-    """Gradient magnitude similarity deviation; blind to a negative."""
+    """Gradient magnitude similarity deviation; invariant to inverted contrast."""
     haarpsi: float = 0.5
-    """1 - HaarPSI; blind to a negative."""
+    """1 - HaarPSI; invariant to inverted contrast."""
     cw_ssim: float = 0.0
-    """1 - complex wavelet SSIM; blind to a negative."""
+    """1 - complex wavelet SSIM; invariant to inverted contrast."""
     equalised: float = 0.0
     """1 - SSIM after a soft histogram equalisation."""
     equalised_mse: float = 0.0
     """Mean squared difference after a soft histogram equalisation."""
     detail: float = 0.0
-    """Difference between local strengths of detail, for images with hardly any motion before them:
-    there the other distances favour blur over slightly misplaced strokes. Blind to a negative."""
+    """Difference of the local contrast of fine detail, only for images after hardly any motion,
+    where the other distances prefer blur to slightly misplaced edges. Invariant to inverted
+    contrast."""
     random_features: float = 0.0
     """Distance between the features of a random network."""
     lambda_tc: float = 2.0
     """Weight of the temporal consistency."""
     l0: int = 10
-    """First image whose temporal consistency counts, as the state must warm up first; 0 if the
-    state is warm from the start."""
+    """First image, counted from 0, whose temporal consistency counts, as the state must warm up
+    first; 0 if the state is warm from the start."""
     L: int = 20
     """Last image of a sequence, counted from 0."""
 

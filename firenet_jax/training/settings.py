@@ -59,7 +59,7 @@ class Train:
     crop: int = 96
     """Height and width of the sequences, in pixels."""
     windows: int = 21
-    """Windows per step, L + 1 in the paper."""
+    """Windows per step: more than --l0 and at most --L + 1 (11 to 21 with the defaults)."""
     chain: int = 1
     """Truncated back-propagation through time: carry the state through up to this many steps.
     Sequences of a batch differ in length, in a geometric series (64, batch 4: 3, 8, 23, 64)."""
@@ -72,12 +72,12 @@ class Train:
     """Share of the sequences with hardly any motion; they have more threshold mismatch, and most of
     them hardly any noise."""
     swift: float = 0.0
-    """Share of the sequences with a motion of 16 to 90 pixels per window, over a plain
+    """Share of the sequences with very fast motion, 16 to 90 pixels per window, over a plain
     background."""
     to_and_fro: float = 0.0
-    """Share of the simulated sequences in which every step is the same windows, forward and then
-    backward (time reversed, polarity inverted), to teach the network to remember. Needs an even
-    number of windows, and a chain."""
+    """Share of the simulated sequences in which every step of a chain shows the same windows
+    forward and then backward (time reversed, polarity inverted), to teach the network to retain
+    what it has seen. Needs an even number of windows."""
     learning_rate: float = 1e-3
     """Peak learning rate, after the warm-up; it then decays to a hundredth along a cosine."""
     warmup: int = 200
@@ -135,8 +135,8 @@ class Train:
                 raise SettingsError(f"{name} is {getattr(self, name)}, but must be more than 0")
         if not self.loss.l0 < self.windows <= self.loss.L + 1:
             raise SettingsError(
-                f"windows is {self.windows}, but the loss is over more than {self.loss.l0} and at "
-                f"most {self.loss.L + 1} of them"
+                f"windows is {self.windows}, but must be more than --l0 ({self.loss.l0}) and at "
+                f"most --L + 1 ({self.loss.L + 1})"
             )
         if not any(getattr(self.loss, name) for name in DISTANCES):
             raise SettingsError(f"no distance has a weight: pass one of {', '.join(DISTANCES)}")
