@@ -20,8 +20,18 @@ from firenet_jax import cli
 from firenet_jax.commands import live
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Recording, concatenate
+from firenet_jax.filters import find_hot_pixels
 from firenet_jax.live import sources
-from firenet_jax.live.engine import Arrived, Figures, Limits, Waiting, pictures, sound, windows
+from firenet_jax.live.engine import (
+    Arrived,
+    Figures,
+    Limits,
+    Waiting,
+    cooled,
+    pictures,
+    sound,
+    windows,
+)
 from firenet_jax.live.page import Board, serve
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pictures import Display
@@ -250,6 +260,36 @@ def test_what_cannot_be_is_left_out_and_counted():
     assert rows(found) == [(5, 0, 0, True)] and (figures.events, figures.bad) == (5, 4)
     with pytest.raises(RecordingError, match="--sensor-size and --wire"):
         list(sound([some_events(2000)], 2, 2, Figures()))
+
+
+def test_hot_pixels_are_found_as_events_come_and_left_out(tmp_path):
+    usual = some_events(4000, last=10**6)
+    fires = np.arange(0, 10**6, 500)
+    hot = Events.of(fires, fires * 0 + 7, fires * 0 + 3, fires * 0 + 1)
+    whole = concatenate([usual, hot])
+    whole = whole.select(np.argsort(whole.t, kind="stable"))
+    cuttings = [whole.select(slice(k, k + 100)) for k in range(0, len(whole), 100)]
+    found = list(cooled([Events.empty(), *cuttings], HEIGHT, WIDTH))
+    assert len(found) == len(cuttings) + 1  # an empty arrival tells the time
+    late = concatenate(found[len(found) // 4 :])
+    assert not np.any((late.x == 7) & (late.y == 3))
+    expected = find_hot_pixels(recording_of(tmp_path, whole))
+    assert expected.sum() == 1
+    left = concatenate(list(cooled(cuttings, HEIGHT, WIDTH, expected)))
+    assert rows(left) == [row for row in rows(whole) if row[1:3] != (7, 3)]
+
+
+def test_hot_pixels_of_a_file_and_a_camera_upside_down(tmp_path):
+    events = some_events(50)
+    x, y = int(events.x[0]), int(events.y[0])
+    (tmp_path / "hot.txt").write_text(f"{x},{y}\n")
+    asked = live.Live("-", hot_pixels=str(tmp_path / "hot.txt"), flip=True)
+    (found,) = live.prepared(asked, HEIGHT, WIDTH)(iter([events]))
+    assert rows(found) == [
+        (t, WIDTH - 1 - a, HEIGHT - 1 - b, p) for t, a, b, p in rows(events) if (a, b) != (x, y)
+    ]
+    (same,) = live.prepared(live.Live("-"), HEIGHT, WIDTH)(iter([events]))
+    assert rows(same) == rows(events)
 
 
 # ---- Threads

@@ -4,7 +4,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -15,8 +15,9 @@ import tyro
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.events import Events, counted
+from firenet_jax.filters import read_hot_pixels, turned
 from firenet_jax.live import sources
-from firenet_jax.live.engine import Figures, Limits, pictures
+from firenet_jax.live.engine import Figures, Limits, cooled, pictures
 from firenet_jax.live.page import Board, serve
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
@@ -35,7 +36,7 @@ class Live:
 
     Examples:
       firenet live recording.aedat4 --replay
-      firenet live camera
+      firenet live camera --hot-pixels auto
       firenet live udp://127.0.0.1:3333 --sensor-size 640x480
       my_program | firenet live - --sensor-size 240x180 --wire text
     """
@@ -62,6 +63,11 @@ class Live:
     """Longest duration of a window in milliseconds."""
     behind: int = 2
     """How many windows may wait; if there are more, the oldest is dropped."""
+    hot_pixels: str | None = None
+    """Ignore these pixels: a file of `x,y` lines, or `auto` to find them among the events that have
+    come so far."""
+    flip: bool = False
+    """Rotate the picture by 180 degrees."""
     port: int = 8765
     """Port of the page, on 127.0.0.1; 0: any free port."""
     show: bool = False
@@ -118,9 +124,23 @@ def _pieces(source: str):
     return sources.growing(Path(source)), False
 
 
+def prepared(settings: Live, height: int, width: int) -> Callable:
+    """Arrivals -> arrivals without hot pixels, rotated, as the settings say."""
+    learn = settings.hot_pixels in (None, "auto")
+    hot = None if learn else read_hot_pixels(str(settings.hot_pixels), height, width)
+
+    def prepare(arrivals: Iterator[Events]) -> Iterator[Events]:
+        if settings.hot_pixels is not None:
+            arrivals = cooled(arrivals, height, width, hot)
+        return turned(arrivals, height, width) if settings.flip else arrivals
+
+    return prepare
+
+
 def run(settings: Live) -> None:
     """Until the source ends, `seconds` are over or Ctrl-C; then says what was seen."""
     source = source_of(settings)
+    prepare = prepared(settings, source.height, source.width)
     weights = load_weights(settings.weights)
     figures, board = Figures(), Board()
     screen = Screen() if settings.show else None
@@ -138,7 +158,7 @@ def run(settings: Live) -> None:
     if settings.seconds is not None:
         source = source._replace(arrivals=_first(settings.seconds, source.arrivals))
     limits = Limits(count, round(1000 * settings.longest), settings.behind)
-    shown = pictures(source, weights, limits, figures, settings.display)
+    shown = pictures(source, weights, limits, figures, settings.display, prepare)
     try:
         for picture in shown:
             board.hang(picture)

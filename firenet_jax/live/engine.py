@@ -19,6 +19,7 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, concatenate
+from firenet_jax.filters import hot_pixels_of
 from firenet_jax.live.sources import Source
 from firenet_jax.network import Weights
 from firenet_jax.pictures import Display
@@ -27,6 +28,7 @@ from firenet_jax.tensors import capacity, pack
 
 LATENCIES_KEPT = 2000  # latencies, of which median and 95th percentile are told
 BAD_AFTER = 1000  # events, of which most may not be bad at the start
+LEARN_FROM = 5_000_000  # events, as in `filters.find_hot_pixels`
 
 
 class Limits(NamedTuple):
@@ -95,6 +97,26 @@ def sound(
             if len(events):
                 last = int(events.t[-1])
         yield events
+
+
+def cooled(
+    arrivals: Iterable[Events], height: int, width: int, hot: np.ndarray | None = None
+) -> Iterator[Events]:
+    """Leaves out the events of hot pixels, (H, W) bool. Empty arrivals stay: they tell the time.
+
+    None: pixels that are hot among the events so far, by the rule of `filters.find_hot_pixels`,
+    found anew whenever the events have doubled, from one for four pixels to five million.
+    """
+    counts = np.zeros((height, width), np.int64)
+    learning, seen, due = hot is None, 0, height * width // 4
+    mask = np.zeros((height, width), bool) if hot is None else hot
+    for events in arrivals:
+        if learning:
+            np.add.at(counts, (events.y, events.x), 1)
+            seen += len(events)
+            if seen >= due:
+                mask, due, learning = hot_pixels_of(counts), 2 * seen, seen < LEARN_FROM
+        yield events.select(~mask[events.y, events.x])
 
 
 def windows(
@@ -177,10 +199,12 @@ def pictures(
     limits: Limits,
     figures: Figures,
     settings: Display = Display(),
+    prepare: Callable[[Iterator[Events]], Iterator[Events]] = iter,
 ) -> Generator[np.ndarray, None, None]:
     """A source -> pictures (H, 2 W, 3) uint8, the events beside the reconstruction.
 
-    figures: what is measured is noted down there.
+    figures: what is measured is noted down there. prepare: from events of this sensor, in order of
+    time, to those that are cut into windows.
     """
     height, width = source.height, source.width
     size = capacity(limits.count)
@@ -198,7 +222,7 @@ def pictures(
     jax.block_until_ready(compute(session, Events.empty()))  # compiled before the first event
 
     waiting = Waiting(limits.behind, figures)
-    arrivals = sound(source.arrivals, height, width, figures)
+    arrivals = prepare(sound(source.arrivals, height, width, figures))
     cut = windows(arrivals, limits.count, limits.longest)
     reading = threading.Thread(target=waiting.fill, args=(cut,), daemon=True)
     reading.start()
