@@ -8,6 +8,7 @@ import contextlib
 import ctypes
 import importlib
 import inspect
+import io
 import logging
 import os
 import sys
@@ -125,6 +126,8 @@ def program() -> int:
     for name in ("stdin", "stdout", "stderr"):  # one that is closed is None, and breaks libraries
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))
+        elif isinstance(stream := getattr(sys, name), io.TextIOWrapper) and name != "stdin":
+            stream.reconfigure(errors="backslashreplace")  # names may hold bytes that are no text
     try:
         code = main()
     except SystemExit as stop:  # of the help and of what tyro cannot read

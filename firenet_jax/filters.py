@@ -12,7 +12,7 @@ from scipy.ndimage import median_filter
 
 from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.events import MAX_TIME, Events, Recording, until_damage
-from firenet_jax.storage.files import check_readable
+from firenet_jax.storage.files import check_no_pipe, check_readable
 
 
 def check_span(start: float | None, stop: float | None) -> None:
@@ -100,6 +100,7 @@ def read_hot_pixels(path: str | Path, height: int, width: int) -> np.ndarray:
     path = Path(path)
     hot = np.zeros((height, width), bool)
     check_readable(path, RecordingError)
+    check_no_pipe(path, RecordingError)
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -23,7 +23,7 @@ at the beginning, with a state that knows the scene.
 import itertools
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import NamedTuple
@@ -32,7 +32,7 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.events import Events, Recording, concatenate
-from firenet_jax.windows import Window, Windows, cut
+from firenet_jax.windows import MAX_GAP, Window, Windows, cut
 
 WARM_UP = 20  # windows
 MOST_WARMING = 8.0  # events per pixel, slightly more than twenty usual windows
@@ -54,7 +54,7 @@ class Counts:
 
     seen: int = 0
     early: int = 0  # before the first event
-    late: int = 0  # after the last event; 0 for an endless grid
+    late: int = 0  # after the last event; 0 for an endless grid, 1 for other endless iterators
 
     @property
     def outside(self) -> str:
@@ -79,21 +79,31 @@ def steps(
     check(windows)
     cutter = cut(recording, windows) if cutter is None else cutter
     counts = Counts() if counts is None else counts
-    endless, times = isinstance(times, Grid), _in_order(times)
+    grid, sized = times if isinstance(times, Grid) else None, isinstance(times, Sized)
+    times = _in_order(times)
     time = next(times, None)
     before = Events.empty()
     for window, begin, end in _spans(windows, iter(cutter)):
+        last = int(window.events.t[-1]) if len(window.events) else end
+        pause = grid is not None and end - last > MAX_GAP  # there may be billions of times in it
+        if grid is not None and time is not None and time < begin:
+            counts.early += grid.skip(begin)
         while time is not None and time < begin:  # only before the first window
             counts.early += 1
             time = next(times, None)
-        while time is not None and time < end:
+        while time is not None and time < (last + 1 if pause else end):
             yield _look(recording, windows, before, window.events, begin, int(time))
             counts.seen += 1
             time = next(times, None)
         yield Step(window.events, None, 1.0)
         before = window.events
-    if time is not None and not endless:
-        counts.late += 1 + sum(1 for _ in times)
+        if pause:
+            raise RecordingError(
+                f"{recording.path}: no event from {last / 1e6:.6f} to {end / 1e6:.6f} s, more than "
+                "an hour: leave one side out with --start or --stop, or use --at"
+            )
+    if time is not None and grid is None:
+        counts.late += 1 + (sum(1 for _ in times) if sized else 0)
 
 
 def warming(
@@ -212,6 +222,12 @@ class Grid:
         time = self.first + round(self.number * self.interval)
         self.number += 1
         return time
+
+    def skip(self, time: int) -> int:
+        """Passes over times well before this one; returns how many."""
+        count = max(math.floor((time - self.first) / self.interval) - 1 - self.number, 0)
+        self.number += count
+        return count
 
 
 def grid(first: int, rate: float, from_zero: bool = False) -> Grid:

@@ -139,6 +139,19 @@ def test_the_program_runs_in_huge_pages_unless_told_otherwise(here, chosen):
     assert ran.stdout.strip() == f"{chosen or cli.HUGE_PAGES} ['info', 'a b.txt']"
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="names there are text")
+def test_names_that_are_no_text_can_be_said(here):
+    name = os.fsencode(here / "caf") + b"\xe9.txt"
+    os.rename(here / "a.txt", name)
+    command = [sys.executable, "-m", "firenet_jax.cli", "info", name]
+    environment = os.environ | {"PYTHONIOENCODING": "utf-8:strict"}
+    ran = subprocess.run(command, env=environment, capture_output=True, timeout=60)
+    assert ran.returncode == 0 and b"Traceback" not in ran.stderr, ran.stderr
+    os.truncate(name, 0)
+    ran = subprocess.run(command, env=environment, capture_output=True, timeout=60)
+    assert ran.returncode == 1 and b"caf\\udce9.txt" in ran.stderr, ran.stderr
+
+
 @pytest.mark.parametrize("output", ["out", "out.mp4", "out.gif"])
 def test_reconstruct_writes_each_kind_of_output(here, capsys, output):
     line = f"reconstruct a.txt -o {output} -c weights.npz -N 100 --preview"

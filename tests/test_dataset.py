@@ -1,6 +1,8 @@
 import json
 import math
 import sys
+from fractions import Fraction
+from pathlib import Path
 
 import av
 import h5py
@@ -12,7 +14,7 @@ from PIL import Image
 from firenet_jax import cli
 from firenet_jax.commands import simulate as dataset
 from firenet_jax.commands.simulate import Simulate, rounded_flow, run
-from firenet_jax.errors import OutputError
+from firenet_jax.errors import OutputError, PictureError
 from firenet_jax.events import Events, concatenate
 from firenet_jax.readers import open_recording
 from firenet_jax.simulation.clip import read_clip
@@ -299,6 +301,46 @@ def test_what_another_run_is_writing_is_left_alone(tmp_path):
     assert partial.read_bytes() == b"half of it"
 
 
+def test_partial_files_elsewhere_in_a_folder_are_left_alone(tmp_path):
+    run(settings(tmp_path, sequences=1, validation=0))
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/other.partial.h5").write_bytes(b"mine")
+    (tmp_path / "train/000001.partial.h5").write_bytes(b"of a run that was killed")
+    run(settings(tmp_path, sequences=2, validation=0))
+    assert [path.parent.name for path in tmp_path.rglob("*.partial.h5")] == ["mine"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
+def test_two_runs_cannot_write_one_file(tmp_path):
+    path, events = tmp_path / "a.h5", random_events(500)
+
+    def meanwhile():
+        yield random_pictures([0])[0]
+        with pytest.raises(OutputError, match="a.h5: another run is writing it"):
+            write_sequence(
+                path, iter([]), iter(random_pictures([0, 9])), height=HEIGHT, width=WIDTH
+            )
+        yield random_pictures([0, 10])[1]
+
+    write_sequence(path, iter([events]), meanwhile(), height=HEIGHT, width=WIDTH)
+    assert concatenate(list(open_recording(path).events())).t.tolist() == events.t.tolist()
+
+
+def test_a_file_that_another_run_has_just_written_is_not_emptied(tmp_path, monkeypatch):
+    path = tmp_path / "a.h5"
+    original = sequence_file.lock_file
+
+    def late(opened, name):  # the other run renames it between our opening it and our lock
+        sequence_file.partial_name(path).replace(path)
+        path.write_bytes(b"done")
+        original(opened, name)
+
+    monkeypatch.setattr(sequence_file, "lock_file", late)
+    with pytest.raises(OutputError):
+        write_sequence(path, iter([]), iter(random_pictures([0, 9])), height=HEIGHT, width=WIDTH)
+    assert path.read_bytes() == b"done"
+
+
 def test_a_run_with_more_sequences_adds_the_others(tmp_path, capsys):
     run(settings(tmp_path, sequences=1, validation=0))
     run(settings(tmp_path, sequences=3, validation=1))
@@ -433,6 +475,9 @@ def bad_lines(folder):
     Image.fromarray(np.zeros((16, 16), np.uint8)).save(folder / "one.png")
     (folder / "damaged").mkdir()
     (folder / "damaged/settings.json").write_text("{")
+    (folder / "run/data").mkdir(parents=True)
+    (folder / "run/settings.json").write_text('{"crop": 96, "seed": 3}')
+    (folder / "run/data/other.partial.h5").write_text("another program's")
     run(settings(folder / "other", sequences=1, validation=0))
     with av.open(str(folder / "sound.wav"), "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000)
@@ -445,6 +490,7 @@ def bad_lines(folder):
         ("-o a.h5", "go into a folder"),
         ("-o file/set", "cannot make this folder"),
         ("-o damaged", "is damaged"),
+        ("-o run", "settings.json is of something else (it says crop): choose another output"),
         ("-o other", "scene.speed was [20.0, 100.0], now [3.0, 1000.0], seconds was 0.2, now 2.0"),
         ("-o out --video clip.mp4", "out.h5"),
         ("-o out.h5 --video clip.mp4", "cannot be read as a video"),
@@ -464,7 +510,9 @@ def test_everything_wrong_is_one_sentence(tmp_path, monkeypatch, capsys):
         code = cli.main(["simulate", *line.split()])
         error = capsys.readouterr().err
         assert code == 1 and expected in error and error.count("\n") == 1, (line, error)
-    assert not list(tmp_path.rglob("*partial*")) and not (tmp_path / "out.h5").exists()
+    assert list(tmp_path.rglob("*partial*")) == [tmp_path / "run/data/other.partial.h5"]
+    assert (tmp_path / "run/settings.json").read_text() == '{"crop": 96, "seed": 3}'
+    assert not (tmp_path / "out.h5").exists()
     assert (tmp_path / "taken/letter.txt").read_text() == "mine"
 
 
@@ -479,6 +527,8 @@ def test_everything_wrong_is_one_sentence(tmp_path, monkeypatch, capsys):
         ("-o new --sensor-size big", "sensor size 'big'"),
         ("-o new --sensor-size 40000x16", "at most 32768"),
         ("-o new --seed -1", "seed is -1"),
+        ("-o new --refractory 2.5", "a refractory period of 2.5 s, but at most 2.1 s"),
+        ("-o new --refractory-range .001 5", "a refractory period of 5 s"),
         ("-o new.h5 --video clip.mp4 --fps 5 --objects 7", "fps, scene: no part in turning"),
         ("-o new.h5 --video clip.mp4 --flicker .1 .9", "too far apart to show it"),
     ],
@@ -538,6 +588,33 @@ def test_training_and_validation_choose_from_other_textures(tmp_path, monkeypatc
     monkeypatch.setattr(dataset, "sequence", lambda key, textures, *_: ((), ()))
     run(settings(tmp_path / "set", sequences=6, validation=2))
     assert len(chosen) == 3  # two of training, one of validation
+
+
+def test_a_clip_may_have_a_colon_in_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ramp(tmp_path / "clip.mkv", count=3)
+    (tmp_path / "clip.mkv").rename("12:00.mkv")
+    assert len(list(read_clip(Path("12:00.mkv")))) == 3
+
+
+def test_a_clip_whose_size_changes_is_one_sentence(tmp_path):
+    path = tmp_path / "change.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mjpeg", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
+        smaller = av.CodecContext.create("mjpeg", "w")
+        smaller.width, smaller.height, smaller.pix_fmt = 32, 24, "yuvj420p"
+        smaller.time_base = stream.time_base = Fraction(1, 25)
+        for number in range(6):
+            encoder, size = (stream, (48, 64, 3)) if number < 4 else (smaller, (24, 32, 3))
+            frame = av.VideoFrame.from_ndarray(np.full(size, 90, np.uint8), format="rgb24")
+            frame.pts, frame.time_base = number, Fraction(1, 25)
+            for packet in encoder.encode(frame.reformat(format="yuvj420p")):
+                packet.stream = stream
+                container.mux(packet)
+    with pytest.raises(PictureError, match="picture 5 has 32x24 pixels, those before 64x48"):
+        list(read_clip(path))
+    assert {picture.image.shape for picture in read_clip(path, (24, 32))} == {(24, 32)}
 
 
 def test_times_of_a_clip_count_from_its_first_picture(tmp_path):

@@ -7,6 +7,7 @@ import importlib
 import json
 import re
 import shlex
+import sys
 import zipfile
 from html.parser import HTMLParser
 from pathlib import Path
@@ -328,6 +329,13 @@ def test_other_settings_are_refused_by_name_and_replaced_when_told(folder, tmp_p
     (tmp_path / "mine" / "file").write_text("mine")
     with pytest.raises(OutputError, match="something else"):
         run(settings(folder, tmp_path / "mine", **other))
+    (tmp_path / "mine" / "results").mkdir()
+    for name, text in (("index.html", "mine"), ("results.json", '{"mine": 1}')):
+        (tmp_path / "mine" / name).write_text(text)
+        with pytest.raises(OutputError, match="something else"):
+            run(settings(folder, tmp_path / "mine", **other))
+        assert (tmp_path / "mine" / name).read_text() == text
+        (tmp_path / "mine" / name).unlink()
 
 
 def test_pictures_of_other_settings_are_not_shown_beside_a_gap(folder, tmp_path, monkeypatch):
@@ -593,6 +601,32 @@ def test_a_file_in_a_folder_that_cannot_be_opened_is_a_gap(folder, tmp_path, cap
     (data / "good.h5").unlink()
     with pytest.raises(RecordingError, match="nothing can be evaluated: data-half / hf: "):
         run(settings(folder, tmp_path / "none", data=(data,), methods="hf"))
+
+
+def test_a_recording_that_cannot_be_cut_is_a_gap_beside_the_others(folder, tmp_path):
+    data = tmp_path / "data"
+    write(data / "good.h5", 6)
+    late = events_of(3000, 400_000)
+    late = Events.of(late.t + 4 * 10**9, late.x, late.y, late.p)
+    early = Events.of([0], [1], [1], [1])
+    write(data / "pause.h5", 6, concatenate([early, late]), begin=4 * 10**9)
+    for _ in range(2):
+        results = run(settings(folder, tmp_path / "out", data=(data,), methods="hf"))
+        assert results["sequences"]["data-good"]["methods"]["hf"]["frames"] == 5
+        assert "gap" in results["sequences"]["data-pause"]["methods"]["hf"]
+        assert (tmp_path / "out/index.html").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
+def test_links_back_to_a_folder_are_not_followed_for_ever(tmp_path):
+    (tmp_path / "set/inner").mkdir(parents=True)
+    (tmp_path / "elsewhere").mkdir()
+    for name in ("set/a.h5", "set/inner/b.h5", "elsewhere/c.h5"):
+        (tmp_path / name).touch()
+    (tmp_path / "set/inner/back").symlink_to(tmp_path / "set")
+    (tmp_path / "set/link").symlink_to(tmp_path / "elsewhere")
+    names = [str(path.relative_to(tmp_path)) for path in evaluate.recordings_in(tmp_path / "set")]
+    assert names == ["set/a.h5", "set/inner/b.h5", "set/link/c.h5"]
 
 
 def test_folders_are_searched_for_all_formats_that_can_hold_frames(tmp_path):

@@ -1,6 +1,7 @@
 """Files: whole or not there; damaged ones refused by name."""
 
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from firenet_jax.storage.files import (
     OutputError,
+    files_in,
     identity,
     read_arrays,
     write_arrays,
@@ -49,6 +51,22 @@ def test_what_is_in_the_way_is_named(tmp_path):
     (tmp_path / "a.partial.txt").mkdir()
     with pytest.raises(OutputError, match=r"a.txt: cannot write \(.*, .*a.partial.txt\)"):
         write_text(tmp_path / "a.txt", "new")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
+def test_files_in_a_folder_are_those_behind_links_too_each_once(tmp_path):
+    for name in ("set/a", "set/inner/b", "elsewhere/c"):
+        (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
+        (tmp_path / name).touch()
+    (tmp_path / "set/inner/back").symlink_to(tmp_path / "set")
+    (tmp_path / "set/link").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "set/again").symlink_to(tmp_path / "elsewhere")
+    assert sorted(path.name for path in files_in(tmp_path / "set")) == ["a", "b", "c"]
+
+
+def test_names_that_are_no_text_do_not_stop_a_file_from_being_written(tmp_path):
+    write_text(tmp_path / "table.csv", "caf\udce9.npz,1")
+    assert (tmp_path / "table.csv").read_text() == "caf\\udce9.npz,1"
 
 
 def test_what_libraries_say_of_a_full_disk_is_one_line(tmp_path):

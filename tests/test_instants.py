@@ -1,5 +1,7 @@
 """Steps against a slow list of what each must hold; images against single steps of the network."""
 
+import itertools
+
 import jax
 import numpy as np
 import pytest
@@ -326,6 +328,41 @@ def test_seconds_are_no_times(weights, recording, caplog):
     assert not caplog.text
     assert not list(images_at(weights, recording, [0, 2**60]))
     assert "1 before its first event, 1 after its last one" in caplog.text
+
+
+def at_times(t):
+    return Events.of(t, t * 0, t * 0, t % 2)
+
+
+def test_a_rate_does_not_fill_a_pause_of_more_than_an_hour():
+    early, late = np.arange(1000) * 100, 10**13 + np.arange(1000) * 100
+    recording = recording_of(at_times(np.concatenate([early, late])), 100)
+    found, counts = [], Counts()
+    with pytest.raises(RecordingError, match="no event from 0.099900 to .* more than an hour"):
+        for entry in steps(recording, Windows(events=100), grid(0, 1000), counts=counts):
+            found.append(entry)
+    assert [s.time for s in found if s.time is not None] == list(range(0, 100_000, 1000))
+    asked = [500, 10**12, 10**13 + 50_000]
+    looks = [s.time for s in steps(recording, Windows(events=100), asked) if s.time is not None]
+    assert looks == asked
+
+
+def test_times_before_the_first_event_are_skipped_at_once():
+    recording = recording_of(at_times(10**15 + np.arange(1000) * 100))
+    counts = Counts()
+    times = [s.time for s in steps(recording, Windows(events=90), grid(3, 1000), counts=counts)]
+    found = [time for time in times if time is not None]
+    assert counts.early == 10**12 and counts.seen == len(found) == 100
+    assert found[0] == 10**15 + 3
+
+
+def test_an_endless_iterator_of_times_ends_with_the_recording(recording):
+    events = whole(recording)
+    counts = Counts()
+    times = itertools.count(int(events.t[0]), 1000)
+    found = [s.time for s in steps(recording, Windows(events=90), times, counts=counts) if s.time]
+    assert found == list(range(int(events.t[0]), int(events.t[-1]) + 1, 1000))
+    assert counts.late == 1
 
 
 def test_impossible_choices(weights, recording):

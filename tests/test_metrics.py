@@ -338,6 +338,8 @@ def test_event_correlation_equals_least_squares_block_by_block():
             velocity = np.linalg.lstsq(matrix, events[block].ravel())[0]
             fit += ((matrix @ velocity) ** 2).sum()
             total += (events[block] ** 2).sum()
+    flat = jax.grad(lambda image: metrics.event_correlation(image, votes).sum())
+    assert np.isfinite(flat(np.zeros_like(image))).all() and np.isfinite(flat(image)).all()
     actual = metrics.event_correlation(np.stack([image, 1 - 3 * image]), np.stack([votes] * 2))
     np.testing.assert_allclose(actual, (fit / total) ** 0.5, rtol=1e-3)
 

@@ -283,6 +283,17 @@ def run_flipped(tmp_path, weights, recording, choices):
     return pictures_of(tmp_path / "turned")[0]
 
 
+def test_a_recording_that_cannot_be_opened_does_not_keep_others_from_being_done(tmp_path, weights):
+    good = write_recording(tmp_path / "good.txt", 300)
+    (tmp_path / "half.npz").write_bytes(b"PK" + bytes(300))
+    with pytest.raises(RecordingError, match=r"half\.npz.*the other recordings are done"):
+        run(settings(weights, (tmp_path / "half.npz", good), tmp_path / "out"))
+    assert len(pictures_of(tmp_path / "out/good")[0]) == 3
+    with pytest.raises(RecordingError, match=r"none\.npz"):  # a wrong name stops at once
+        run(settings(weights, (good, tmp_path / "none.npz"), tmp_path / "other"))
+    assert not (tmp_path / "other").exists() or not list((tmp_path / "other").iterdir())
+
+
 @pytest.mark.parametrize("batch", [1, 2])
 def test_a_damaged_recording_does_not_keep_others_from_being_done(
     tmp_path, weights, batch, monkeypatch

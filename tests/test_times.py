@@ -1,6 +1,8 @@
 """Times that are asked for, against what their files say in other words."""
 
 import logging
+import os
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,6 +12,8 @@ from test_windows import recording_of
 
 from firenet_jax.commands.times import Times, times_of
 from firenet_jax.errors import RecordingError
+from firenet_jax.events import MAX_TIME
+from firenet_jax.filters import read_hot_pixels
 from firenet_jax.instants import Grid
 
 T = 5_000_000 + np.arange(0, 2_000_000, 1000)  # 5 to 7 s on the sensor's clock
@@ -86,6 +90,20 @@ def test_times_of_today_keep_their_microseconds(tmp_path):
 def test_files_that_are_of_no_use(tmp_path, recording, text, said):
     with pytest.raises(RecordingError, match=said):
         read(tmp_path, recording, text)
+
+
+def test_numbers_beyond_all_times_lie_outside(tmp_path, recording):
+    found = read(tmp_path, recording, "5.25\n5.5\n1e999999999\n")
+    assert found[:2].tolist() == [5_250_000, 5_500_000] and found[2] == MAX_TIME
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pipes with names")
+def test_lists_are_read_more_than_once_so_they_are_no_pipes(tmp_path, recording):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(RecordingError, match="is a pipe or device, but is read more than once"):
+        times_of(Times(at=tmp_path / "pipe"), recording, recording.events())
+    with pytest.raises(RecordingError, match="is a pipe or device, but is read more than once"):
+        read_hot_pixels(tmp_path / "pipe", 4, 5)
 
 
 def test_a_file_that_is_not_there(tmp_path, recording):

@@ -469,6 +469,34 @@ def test_a_finished_run_is_lengthened_and_ctrl_c_saves(tmp_path, monkeypatch, ca
     assert steps == [1, 2, 3, 4, 5, 6]
 
 
+def test_files_of_others_are_not_replaced(tmp_path):
+    (tmp_path / "run").mkdir()
+    for name in ("weights.npz", "last.npz", "log.jsonl"):
+        (tmp_path / "run" / name).write_text("mine")
+        with pytest.raises(OutputError, match=f"holds {name}, but no settings.json of a run"):
+            run(tiny(tmp_path / "run"))
+        assert (tmp_path / "run" / name).read_text() == "mine"
+        (tmp_path / "run" / name).unlink()
+
+
+def test_a_run_resumes_on_the_files_that_it_began_with(tmp_path, monkeypatch):
+    (tmp_path / "set/train").mkdir(parents=True)
+    (tmp_path / "set/train/a.h5").write_bytes(b"a")
+    asked = tiny(tmp_path / "run", data=(tmp_path / "set",))
+    record = train._record(asked)
+    (tmp_path / "set/train/b.h5").write_bytes(b"b")
+    other = train._record(asked)
+    assert record["files"] != other["files"]
+    assert {name for name in record if record[name] != other[name]} == {"files"}
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/settings.json").write_text(json.dumps(record))
+    with pytest.raises(OutputError, match="files was"):
+        train._check_settings(asked.output, asked)
+    del record["files"]  # of a run of before they were recorded
+    (tmp_path / "run/settings.json").write_text(json.dumps(record))
+    train._check_settings(asked.output, asked)
+
+
 def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypatch):
     Log(tmp_path, 0).write(1, "validation", {"loss": jnp.float32(3)})
 
@@ -489,7 +517,7 @@ def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypa
         ({"learning_rate": float("inf")}, "learning_rate"),
         ({"loss": Loss(l1=0, nlpd=0, haarpsi=0, l0=1)}, "no distance has a weight"),
         ({"save_every": float("nan")}, "save_every is nan"),
-        ({"windows": 22}, "at most 21"), ({"windows": 1}, "more than 1"),
+        ({"windows": 22}, r"at most --L \+ 1 \(21\)"), ({"windows": 1}, r"more than --l0 \(1\)"),
         ({"warmup": 6}, "warmup"), ({"warmup": -5}, "warmup"),
         ({"log_every": 0}, "log_every"), ({"validate_every": 0}, "validate_every"),
         ({"crop": 10}, "smaller than 11"), ({"procedural": 3.0}, "procedural"),

@@ -127,6 +127,12 @@ def test_the_same_pictures_give_the_same_bytes(tmp_path, suffix):
     assert len({path.read_bytes() for path in files}) == 1
 
 
+def test_a_video_may_be_named_by_a_time_of_day(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # FFmpeg takes what precedes a colon for a protocol
+    write_video(Path("12:00.mp4"), ramp(), fps=30)
+    assert len(decoded(tmp_path / "12:00.mp4")) == 6
+
+
 def test_an_abandoned_video_leaves_nothing(tmp_path):
     writer = VideoWriter(tmp_path / "video.mp4", 30)
     writer.write(ramp()[0])

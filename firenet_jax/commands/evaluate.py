@@ -255,11 +255,14 @@ def is_recording(path: Path) -> bool:
     return any(module.matches(path) for module in modules)
 
 
-def recordings_in(folder: Path) -> list[Path]:
-    found = []
+def recordings_in(folder: Path, above: frozenset[Path] = frozenset()) -> list[Path]:
+    """above: the folders that lead here, as links may lead back to one."""
+    found, above = [], above | {folder.resolve()}
     for path in sorted(folder.iterdir()):
+        if path.is_dir() and path.resolve() in above:
+            continue
         if path.is_dir():
-            found += [path] if is_recording(path) else recordings_in(path)
+            found += [path] if is_recording(path) else recordings_in(path, above)
         elif path.suffix.lower() in SUFFIXES and ".partial" not in path.name:
             found.append(path)
     return found
@@ -325,7 +328,11 @@ def open_folder(
     Raises OutputError where a result was made by other settings, which `overwrite` replaces.
     """
     folder = settings.output
-    if any(folder.iterdir()) and not (folder / "results").is_dir():
+    report = read_record(folder / "results.json", "choose another output")
+    mine = report is None or {"protocol", "sequences"} <= report.keys()
+    if report is None:  # it is written before the others
+        mine = not any((folder / name).exists() for name in ("table.csv", "index.html"))
+    if any(folder.iterdir()) and not ((folder / "results").is_dir() and mine):
         raise OutputError(f"{folder} is a folder of something else: choose another output")
     done = {}
     for key, record in records.items():
@@ -463,6 +470,8 @@ def events_before(plan: Plan, settings: Evaluate, numbers: set[int]) -> dict[int
 
     Drawn anew from the recording, and not kept with each method: it is as long as one of them."""
     recording, found, left = plan.recording, {}, set(numbers)
+    if not left:  # where no method had an image, reading may raise why
+        return found
     windows = ((e.time, e.events) for e in steps_of(plan) if e.time is not None)
     for place, events in matched(windows, plan.times, settings.protocol.tolerated):
         if not left:

@@ -282,7 +282,14 @@ def job_of(
     Raises OutputError if its output exists, RecordingError if it is no recording.
     """
     size = parse_size(settings.sensor_size)
-    recording = open_recording(path, size, settings.strict, settings.columns)
+    try:
+        recording = open_recording(path, size, settings.strict, settings.columns)
+    except RecordingError as error:
+        if len(settings.recordings) == 1 or not path.exists():
+            raise
+        logger.warning("%s", error)
+        outcome.failed[output] = error
+        return None
     if settings.network.color and recording.grey:
         raise RecordingError(
             f"{path}: says that its sensor sees no colours, --color would invent some: leave it out"

@@ -207,7 +207,8 @@ def write_sequences(
     work = work[process::processes]
     # Of a run that was killed; other processes are at work on theirs.
     own = [partial_name(path) for path, *_ in work]
-    for left in own if processes > 1 else settings.output.glob("*/*.partial.h5"):
+    all_left = (path for name in split for path in (settings.output / name).glob("*.partial.h5"))
+    for left in own if processes > 1 else all_left:
         left.unlink(missing_ok=True)
     missing = [entry for entry in work if not entry[0].exists()]
     events = used = 0
@@ -325,6 +326,10 @@ def open_folder(settings: Simulate) -> None:
             "output"
         )
     empty = not next(folder.glob("*/??????.h5"), None)
+    if found is not None and empty and (others := found.keys() - record.keys()):
+        raise OutputError(
+            f"{kept} is of something else (it says {min(others)}): choose another output"
+        )
     if found is not None and not empty:
         check_same(
             found, record, f"{folder} holds sequences of other settings",

@@ -9,7 +9,7 @@ taken, and a notice says which.
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import Literal
 
@@ -18,6 +18,7 @@ import numpy as np
 from firenet_jax.errors import RecordingError, SettingsError, logger
 from firenet_jax.events import MAX_TIME, Events, Recording, counted
 from firenet_jax.instants import Grid, check_rate, grid
+from firenet_jax.storage.files import check_no_pipe
 
 UNITS = {"s": 10**6, "ms": 10**3, "us": 1, "ns": Decimal("0.001")}  # microseconds
 UNIT_OF = {
@@ -181,6 +182,7 @@ def _from_file(path: Path, wanted: Times, recording: Recording) -> np.ndarray:
 def read_times(path: Path) -> tuple[list[str], str | None, bool | None]:
     """A file -> (numbers as written, unit, whether they count from the start); None for what it
     does not state. Raises RecordingError, which names the invalid line."""
+    check_no_pipe(path, RecordingError)
     try:
         if path.stat().st_size > LARGEST:
             raise RecordingError(f"{path}: is larger than {LARGEST >> 20} MB: no list of times")
@@ -237,14 +239,16 @@ def _header(line: str, column: int, unit: str | None, since_start: bool | None):
 
 
 def _scaled(path: Path, numbers: list[str], unit: str) -> np.ndarray:
-    """Decimal numbers -> int64 microseconds, correctly rounded."""
-    try:
-        times = [int((Decimal(number) * UNITS[unit]).to_integral_value()) for number in numbers]
-    except (InvalidOperation, OverflowError):
-        times = [MAX_TIME]
-    if max(map(abs, times)) >= 2**62:
-        times = [min(max(time, -MAX_TIME), MAX_TIME) for time in times]
-    return np.array(times, np.int64)
+    """Decimal numbers -> int64 microseconds, correctly rounded; at most MAX_TIME from 0."""
+
+    def scaled(number: str) -> int:
+        try:
+            time = Decimal(number) * UNITS[unit]
+        except ArithmeticError:  # an exponent of millions
+            return MAX_TIME
+        return int(min(max(time.to_integral_value(), -MAX_TIME), MAX_TIME))
+
+    return np.array([scaled(number) for number in numbers], np.int64)
 
 
 def _span(chunks: Iterable[Events], whole: bool) -> tuple[int | None, int]:

@@ -588,7 +588,7 @@ def event_correlation(image: jax.Array, votes: jax.Array) -> jax.Array:
         return whole.reshape(*values.shape[:-2], rows, PATCH, columns, PATCH).sum((-3, -1))
 
     # The normal equations of two unknowns; a little is added so that a flat block has a solution.
-    least = 1e-6 * summed(down**2 + across**2) + 1e-12
+    least = 1e-6 * summed(down**2 + across**2) + 1e-9  # the gradient divides by its fourth power
     a, b, c = summed(down**2) + least, summed(down * across), summed(across**2) + least
     p, q = summed(down * votes), summed(across * votes)
     fit = (c * p**2 - 2 * b * p * q + a * q**2) / (a * c - b**2)

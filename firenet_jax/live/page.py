@@ -106,7 +106,7 @@ def serve(board: Board, figures: Callable[[], dict], title: str, port: int) -> T
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
-            host = self.headers.get("Host", "").rpartition(":")[0]
+            host = self.headers.get("Host", "").rsplit(":", 1)[0]  # no port: 80
             if host not in ("127.0.0.1", "localhost"):
                 self.send_error(403)
             elif self.path == "/":

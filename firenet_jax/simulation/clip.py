@@ -19,10 +19,11 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
 
     Raises PictureError for what cannot be read, or whose times stand still or leave gaps.
     """
-    first = last = None
+    first = last = shape = None
     check_readable(path)
     try:
-        with av.open(str(path), metadata_errors="replace") as container:
+        # absolute, for FFmpeg takes what precedes a colon for a protocol
+        with av.open(str(path.absolute()), metadata_errors="replace") as container:
             if not container.streams.video or container.format.name == "tty":  # any text is
                 raise PictureError(f"{path}: holds no video, only sound or text: name a video file")
             stream = container.streams.video[0]
@@ -49,6 +50,13 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
                 rgb = frame.to_ndarray(format="rgb24", width=width, height=height)
                 grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
                 upright = np.rot90(np.round(grey).astype(np.uint8), turns)
+                shape = shape or upright.shape
+                if upright.shape != shape:
+                    raise PictureError(
+                        f"{path}: picture {number + 1} has {upright.shape[1]}x{upright.shape[0]} "
+                        f"pixels, those before {shape[1]}x{shape[0]}: pass --sensor-size "
+                        "WIDTHxHEIGHT to scale all alike"
+                    )
                 yield Picture(time, np.ascontiguousarray(upright), None)
     except (FFmpegError, OSError, UnicodeDecodeError) as error:  # names in it that are no text
         reason = getattr(error, "strerror", None) or error

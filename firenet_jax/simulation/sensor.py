@@ -134,6 +134,11 @@ class SensorSettings:
             value = getattr(self, name)
             if value is not None and not (value >= 0 and math.isfinite(value)):
                 raise SettingsError(f"{name} is {value}, but must be 0 or more")
+        longest = max(self.refractory or 0, *(self.refractory_range or (0, 0)))
+        if longest > MAX_INTERVAL * 1e-6:
+            raise SettingsError(
+                f"a refractory period of {longest:g} s, but at most {MAX_INTERVAL * 1e-6:.1f} s"
+            )
         # A range takes precedence, so the other value would silently be ignored.
         for name, owner, remedy in (
             ("threshold", "threshold_range", "for a fixed one pass --threshold-range VALUE VALUE"),

@@ -5,7 +5,6 @@ cut from those that come inside scikit-image's wheel.
 """
 
 import importlib.util
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from firenet_jax.errors import PictureError, logger
+from firenet_jax.storage.files import files_in
 
 PHOTOGRAPHS = {  # that come inside the wheels of these packages
     "skimage/data": (
@@ -74,12 +74,7 @@ def _pictures(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise PictureError(f"{folder}: no such folder: name one with pictures in it")
     held_out = {name for names in HELD_OUT.values() for name in names}
-    found = [
-        Path(at) / name
-        for at, _, names in os.walk(folder)
-        for name in names
-        if name.lower().endswith(SUFFIXES)
-    ]
+    found = [path for path in files_in(folder) if path.name.lower().endswith(SUFFIXES)]
     kept = [path for path in found if path.name.lower() not in held_out]
     if not kept:
         but = f" but {found[0].name}, which is held out for testing" if found else ""

@@ -7,7 +7,7 @@ the error names it.
 import contextlib
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +49,23 @@ def check_readable(path: Path, error: type[ValueError] = OutputError) -> None:
             open(path, "rb").close()
     except PermissionError as refusal:
         raise error(forbidden(refusal.filename or path)) from refusal
+
+
+def files_in(folder: Path) -> Iterator[Path]:
+    """The files in a folder and in folders below it, also those that links lead to, each once."""
+    seen = set()
+    for at, folders, names in os.walk(folder, followlinks=True):
+        if (place := os.path.realpath(at)) in seen:
+            folders.clear()
+            continue
+        seen.add(place)
+        yield from (Path(at) / name for name in names)
+
+
+def check_no_pipe(path: Path, error: type[ValueError] = OutputError) -> None:
+    """Raises `error` for a pipe or device, which is empty when it is read a second time."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise error(f"{path}: is a pipe or device, but is read more than once: make it a file")
 
 
 def forbidden(path: str | Path) -> str:
@@ -144,7 +161,8 @@ def write_text(path: Path, text: str) -> None:
     Raises OutputError where the file cannot be written."""
     beside = partial_name(path)
     with writing(path):
-        beside.write_text(text, encoding="utf-8")
+        # names of files may hold bytes that are no text
+        beside.write_text(text, encoding="utf-8", errors="backslashreplace")
         beside.replace(path)
 
 

@@ -261,7 +261,8 @@ class VideoWriter:
         with writing(path):
             self.held = self.partial.open("ab")
             lock_file(self.held, path)
-            self.container = av.open(str(self.partial), "w")
+            # absolute, for FFmpeg takes what precedes a colon for a protocol
+            self.container = av.open(str(self.partial.absolute()), "w")
         self.stream: Any = None
         self.filter: Graph | None = None
 

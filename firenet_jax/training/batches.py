@@ -30,6 +30,7 @@ from firenet_jax.events import BINS, Events, Rows, checked, concatenate, counted
 from firenet_jax.readers import CHUNK, frame_times, to_events, to_frame
 from firenet_jax.readers.hdf5 import in_order, opened
 from firenet_jax.simulation.sensor import Simulation
+from firenet_jax.storage.files import files_in
 from firenet_jax.tensors import Packed, pack, voxelise
 from firenet_jax.warp import warp
 
@@ -79,7 +80,7 @@ def find(folder: Path) -> list[Path]:
     folder = Path(folder)
     if not folder.is_dir():
         raise RecordingError(f"{folder}: there is no such folder: name one with HDF5 sequences")
-    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+    files = sorted(path for path in files_in(folder) if path.suffix.lower() in SUFFIXES)
     files = [path for path in files if not path.stem.endswith(".partial")]  # of a run that goes on
     if not files:
         raise RecordingError(
@@ -91,7 +92,7 @@ def find(folder: Path) -> list[Path]:
 
 def is_set(path: Path) -> bool:
     """Whether this is a folder of sequences rather than a recording."""
-    return path.is_dir() and any(file.suffix.lower() in SUFFIXES for file in path.rglob("*"))
+    return path.is_dir() and any(file.suffix.lower() in SUFFIXES for file in files_in(path))
 
 
 def split(folder: Path) -> tuple[list[Path], list[Path]]:

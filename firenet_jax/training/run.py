@@ -13,6 +13,7 @@ equals an uninterrupted one. A run is a folder:
 """
 
 import contextlib
+import hashlib
 import itertools
 import signal
 import threading
@@ -36,7 +37,7 @@ from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage import runs
 from firenet_jax.storage.files import locked, write_text
 from firenet_jax.storage.progress import bar
-from firenet_jax.training.batches import NO_AUGMENT, batches, split
+from firenet_jax.training.batches import NO_AUGMENT, batches, find, split
 from firenet_jax.training.log import Log
 from firenet_jax.training.settings import Train
 from firenet_jax.training.step import (
@@ -49,6 +50,7 @@ from firenet_jax.training.step import (
 )
 
 VALIDATION = 8  # batches
+WRITTEN = "log.jsonl", "weights.npz", "last.npz"  # in a folder without a run they are another's
 UNRECORDED = "log_every", "save_every", "validate_every"  # do not affect what is computed
 
 
@@ -258,7 +260,16 @@ def _record(settings: Train) -> dict:
     """Everything that the weights depend on, and how often a run is logged and saved."""
     data = settings.data[0] if len(settings.data) == 1 else list(settings.data) or None
     but = "output", "coordinator", "processes", "process"
-    return runs.recorded(settings, but=but, data=data)
+    return runs.recorded(settings, but=but, data=data, files=_files(settings))
+
+
+def _files(settings: Train) -> str | None:
+    """Names and sizes of the sequences, in short; of recordings, `prepare` sees to it."""
+    if not settings.data or settings.on_recordings:
+        return None
+    folder = settings.data[0]
+    found = [(str(path.relative_to(folder)), path.stat().st_size) for path in find(folder)]
+    return hashlib.sha256(repr(found).encode()).hexdigest()[:16]
 
 
 def _check_settings(folder: Path, settings: Train) -> None:
@@ -272,8 +283,15 @@ def _check_settings(folder: Path, settings: Train) -> None:
     runs.make_folder(folder)
     found = runs.read_record(folder / "settings.json", "choose another --output")
     if found is None:
+        for name in WRITTEN:
+            if (folder / name).exists():
+                raise OutputError(
+                    f"{folder} holds {name}, but no settings.json of a run: choose another --output"
+                )
         return
-    found, now = runs.completed(found, _record(Train(folder))), _record(settings)
+    now = _record(settings)
+    unknown = {} if "files" in found else {"files": now["files"]}  # a run of before it was kept
+    found = runs.completed(found, _record(Train(folder)) | unknown)
     done = (folder / "checkpoints" / str(found["steps"])).is_dir()
     longer = isinstance(found["steps"], int) and found["steps"] < settings.steps
     if longer and done and not runs.differences(found, now, but=(*UNRECORDED, "steps")):
