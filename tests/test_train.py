@@ -319,6 +319,7 @@ def test_other_settings_do_not_continue_a_run(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
 def test_a_run_that_is_still_going_on_is_left_alone(tmp_path):
+    begun(tmp_path, tiny(tmp_path))
     (tmp_path / "log.jsonl").write_text('{"step": 5}\n')
     with locked(tmp_path), pytest.raises(ValueError, match="another run is writing it"):
         run(tiny(tmp_path))
