@@ -46,8 +46,8 @@ class Export:
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """A name that ends in .onnx, .stablehlo, .pth or .safetensors."""
     normalise: bool = True
-    """Without --no-normalise, .onnx and .stablehlo normalise event tensors if the weights expect
-    it."""
+    """Normalise event tensors inside .onnx and .stablehlo, if the weights expect normalised ones.
+    With --no-normalise your program does it."""
     picture: bool = False
     """.onnx and .stablehlo: also output the sharpened 8-bit picture."""
     web: Path | None = None

@@ -106,9 +106,9 @@ class Reconstruct:
     """With --rate, --at, --between-frames or --triggers: name png files by number or by time in
     nanoseconds, as Kalibr expects."""
     topic: str = "/cam0/image_raw"
-    """Topic of the images in a bag."""
+    """Topic of the images in the bag that is written."""
     frame_id: str = "cam0"
-    """Coordinate frame of the images in a bag."""
+    """Coordinate frame of the images in the bag that is written."""
     sensor_size: str | None = None
     """WIDTHxHEIGHT of the sensor, such as 240x180, if the recording does not state it."""
     columns: str | None = None

@@ -50,7 +50,7 @@ class Augment:
     pauses: float = 0.05
     """Probability that the camera stops: a window without events, and the same image again."""
     stay: float = 0.9
-    """Probability that a stopped camera stays so for another window."""
+    """Probability that the pause continues for another window."""
     hot_pixels: float = 1e-3
     """Greatest share of hot pixels, to which a standard normal number is added in all bins."""
     voxel_noise: float = 0.0
