@@ -109,6 +109,19 @@ def test_text_in_seconds_stays_so_from_piece_to_piece():
     assert found.t.tolist() == [600_000]
 
 
+def test_a_last_line_of_text_may_lack_its_end():
+    found = concatenate([*sources.decoded([b"1 2 3 1\n2 ", b"2 3 1"], "text")])
+    assert found.t.tolist() == [1, 2]
+    datagrams = [b"100 1 2 1", b"200 1 2 1\n300 1 2 0"]
+    found = concatenate([*sources.decoded(datagrams, "text", datagrams=True)])
+    assert found.t.tolist() == [100, 200, 300]
+
+
+def test_a_line_without_end_is_refused():
+    with pytest.raises(RecordingError, match="holds a line of more than 65536 bytes"):
+        list(sources.decoded(itertools.repeat(b"1" * 1000), "text"))
+
+
 @pytest.mark.parametrize("text", [b"GET / HTTP/1.1\n", b"1 2 3 nonsense\n", b"1 99999 3 1\n"])
 def test_text_that_is_no_events_is_refused(text):
     with pytest.raises(RecordingError, match="lines of t x y p were expected"):
@@ -194,6 +207,16 @@ class Clock:
         self.now += seconds
 
 
+def test_a_file_that_is_begun_anew_is_said(tmp_path):
+    path = tmp_path / "events.bin"
+    path.write_bytes(written(some_events(100), "t64_x16_y16_on8"))
+    pieces = sources.growing(path)
+    assert len(next(pieces)) == 1300 and next(pieces) == b""
+    path.write_bytes(b"")
+    with pytest.raises(RecordingError, match=r"events\.bin: was begun anew by its writer"):
+        next(pieces)
+
+
 @pytest.mark.parametrize("speed", [0.5, 1.0, 20.0])
 def test_replay_gives_events_when_they_would_have_come(tmp_path, speed):
     chunks = some_events(300, seed=1), some_events(300, start=50_000, seed=2)
@@ -208,6 +231,15 @@ def test_replay_gives_events_when_they_would_have_come(tmp_path, speed):
     assert (np.diff(t) >= 0).all() and t[600] > t[599]
     lateness = (now - 100.0) - (t - t[0]) / 1e6 / speed
     assert lateness.min() > -1e-9 and lateness.max() < sources.SLICE + 1e-9
+
+
+def test_a_recording_that_ends_at_time_zero_is_repeated_after_it(tmp_path):
+    t = np.array([-2000, -1000, 0])
+    recording = recording_of(tmp_path, Events.of(t, t * 0, t * 0, t * 0))
+    clock = Clock()
+    found = sources.replay(recording, 1.0, 2, clock=clock, sleep=clock.sleep)
+    times = np.concatenate([events.t for events in found])
+    assert len(times) == 6 and (np.diff(times) > 0).all()
 
 
 def test_replay_goes_on_an_hour_after_a_clock_was_set(tmp_path):
@@ -228,10 +260,11 @@ def test_replay_goes_on_an_hour_after_a_clock_was_set(tmp_path):
 # ---- Windows
 
 
-def cut(parts, count, longest):
+def cut(parts, count, longest, speed=1.0):
     """parts: (seconds of the clock, events)"""
     clock = iter([now for now, _ in parts])
-    found = windows((events for _, events in parts), count, longest, clock=lambda: next(clock))
+    arrivals = (events for _, events in parts)
+    found = windows(arrivals, count, longest, clock=lambda: next(clock), speed=speed)
     return list(found)
 
 
@@ -251,6 +284,10 @@ def test_the_last_events_before_a_pause_do_not_wait_for_its_end():
     parts = [(0.0, events), (0.01, nothing), (0.039, nothing), (0.041, nothing), (9.0, nothing)]
     found = cut(parts, 60, 40_000)
     assert [(len(w.events), w.at) for w in found] == [(10, 0.0)]
+    parts = [(10 * now, events) for now, events in parts]  # as slow as a tenth
+    assert [(len(w.events), w.at) for w in cut(parts, 60, 40_000, 0.1)] == [(10, 0.0)]
+    parts[2:3] = [(0.3, some_events(5, last=1000, start=2000)), (0.35, nothing)]
+    assert [len(w.events) for w in cut(parts, 60, 40_000, 0.1)] == [15]
 
 
 def test_what_cannot_be_is_left_out_and_counted():
@@ -290,6 +327,20 @@ def test_hot_pixels_of_a_file_and_a_camera_upside_down(tmp_path):
     ]
     (same,) = live.prepared(live.Live("-"), HEIGHT, WIDTH)(iter([events]))
     assert rows(same) == rows(events)
+
+
+@pytest.mark.parametrize("broken", [0, 2**40])
+def test_a_sender_that_starts_again_is_seen_again(broken):
+    before = some_events(5000, start=10**9)
+    if broken:  # one time far ahead, as of a damaged packet
+        before.t[-1] = broken
+    after = [some_events(200, seed=k, last=9000, start=10_000 * k) for k in range(100)]
+    figures = Figures()
+    found = concatenate(list(sound([before, *after], HEIGHT, WIDTH, figures)))
+    assert len(found) >= 5000 + 20_000 - 1200 and figures.bad <= 1200
+    assert (np.diff(found.t) >= 0).all()
+    assert rows(found)[-200:] == [(t, x, y, p) for t, x, y, p in rows(found)[-200:]]
+    assert np.diff(found.t[-200:]).tolist() == np.diff(after[-1].t).tolist()
 
 
 # ---- Threads
@@ -375,6 +426,16 @@ def test_nobody_else_may_ask(page):
         connection, response = ask(port, path, host)
         assert response.status == status
         connection.close()
+
+
+def test_a_browser_that_goes_away_leaves_no_traceback(page, capfd):
+    _, port = page
+    with socket.create_connection(("127.0.0.1", port)) as connection:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        connection.send(b"GET /fig")
+        time.sleep(0.1)
+    time.sleep(0.2)
+    assert capfd.readouterr().err == ""
 
 
 def test_the_video_shows_the_newest_picture(page):

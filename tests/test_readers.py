@@ -142,6 +142,8 @@ def test_unwrap():
     pieces = [*first, *readers.unwrap(wrapped[3:], 8, int(first[-1]))]
     np.testing.assert_array_equal(pieces, expected)
     assert readers.unwrap(np.array([], np.int64), 8, 5).size == 0
+    late = readers.unwrap(np.array([65530, 3, 65534, 65534, 9, 40_000, 1]), 16, 0)  # once round
+    assert late.tolist() == [65530, 65539, 65534, 65534, 65545, 105_536, 131_073]
 
 
 def test_joined():
@@ -675,6 +677,24 @@ def test_cnn_with_a_sensor_that_cannot_be(tmp_path, size):
     refused(write_cnn(tmp_path / "a.h5", size=size), "states a sensor of", size=None)
 
 
+@pytest.mark.parametrize("way", ["virtual", "link"])
+def test_hdf5_does_not_read_other_files_by_links(tmp_path, way):
+    write_cnn(tmp_path / "other.h5")
+    path = write_cnn(tmp_path / "a.h5")
+    with h5py.File(path, "a") as file:
+        count = len(file["events/ts"])
+        if way == "link":
+            del file["events"]
+            file["events"] = h5py.ExternalLink("other.h5", "/events")
+        else:
+            del file["events/ts"]
+            layout = h5py.VirtualLayout((count,), "f8")
+            layout[:] = h5py.VirtualSource("other.h5", "events/ts", (count,))
+            file.create_virtual_dataset("events/ts", layout)
+    with pytest.raises(RecordingError, match="is stored in other files"):
+        events_of(path)
+
+
 @pytest.mark.parametrize("name", ["events/xs", "images/image000000001"])
 def test_hdf5_does_not_read_other_files(tmp_path, name):
     write(tmp_path / "secret", bytes(1000))
@@ -800,6 +820,9 @@ def test_dat(tmp_path, monkeypatch):
         path = write(tmp_path / "a.dat", header + bytes([kind, 8]) + body)
         check(path, size=None)
         assert open_recording(path).count == 5
+    for told in (b"%  Version 2", b"% Version: 2", b"% Version=2"):
+        other = header.replace(b"% Version 2", told)
+        check(write(tmp_path / "b.dat", other + b"\x0c\x08" + body), size=None)
     old = b"".join(struct.pack("<II", t, p << 17 | y << 9 | x) for t, x, y, p in EVENTS)
     check(write(tmp_path / "old.dat", header.replace(b"ion 2", b"ion 1") + b"\x0c\x08" + old))
     # 32 bits of microseconds start again after 71.6 minutes, within a chunk or between two
@@ -927,6 +950,7 @@ def test_raw(tmp_path, version):
         ("% format EVT21;width=320;height=320\n", (320, 320)),
         ("% geometry 640x480\n% evt 3.0\n", (480, 640)),
         ("% Width 304\n% Height 240\n", (240, 304)),
+        ("% Width: 304\n%  Height = 240\n", (240, 304)),
     ],
 )
 def test_size_in_the_header(header, size):
@@ -1338,6 +1362,18 @@ def test_whole_mcap_without_a_storage_plugin(tmp_path, storage):
         check_frames(path, [EPOCH + 7, EPOCH + 30])
 
 
+@pytest.mark.parametrize("name", ["my bag_0", "it's", "a-b.c"])
+def test_ros2_folders_with_any_name(tmp_path, name):
+    bag = Bag(tmp_path / "a", 2)
+    bag.events("/dvs/events", EPOCH, T + EPOCH, X, Y, P)
+    bag.close()
+    (file,) = (tmp_path / "a").glob("*.db3")
+    told = (tmp_path / "a/metadata.yaml").read_text()
+    new = file.rename(tmp_path / "a" / f"{name}.db3")
+    write(tmp_path / "a/metadata.yaml", told.replace(file.name, f'"{new.name}"'))
+    check(tmp_path / "a", t=T + EPOCH, size=None)
+
+
 # ---------------------------------------------------------------- triggers of Prophesee's files
 
 
@@ -1355,6 +1391,48 @@ def test_triggers_of_evt2(tmp_path):
     found = open_recording(path).triggers()
     assert found.times.tolist() == times and found.ids.tolist() == [20, 21, 22, 23, 24]
     assert found.polarity.tolist() == [False, True, False, True, False]
+
+
+def evt_words(version, events):
+    """(t, x, y, p) of each -> bytes, every event with its own time."""
+    if version == "2.0":
+        words = [
+            (0x80000000 | t >> 6, p << 28 | (t & 63) << 22 | x << 11 | y) for t, x, y, p in events
+        ]
+        return np.array(words, "<u4").tobytes()
+    words = [
+        (0x8000 | t >> 12, 0x6000 | t & 0xFFF, y, 0x2000 | p << 11 | x) for t, x, y, p in events
+    ]
+    return np.array(words, "<u2").tobytes()
+
+
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_an_event_outside_the_sensor_that_a_header_names_is_left_out(tmp_path, caplog, version):
+    pytest.importorskip("faery")
+    rng = np.random.default_rng(0)
+    rows = np.stack(
+        [np.arange(9000) * 50, *rng.integers(0, 480, (2, 9000)), rng.integers(0, 2, 9000)]
+    )
+    events = rows.T.tolist()
+    header = f"% evt {version}\n% geometry 640x480\n% end\n".encode()
+    whole = events_of(write(tmp_path / "whole.raw", header + evt_words(version, events)), None)
+    assert np.stack([whole.t, whole.x, whole.y, whole.p]).tolist() == rows.tolist()
+    events[4321][1] = 700
+    path = write(tmp_path / "a.raw", header + evt_words(version, events))
+    found = events_of(path, None)
+    kept = np.delete(rows, 4321, 1)
+    assert np.stack([found.t, found.x, found.y, found.p]).tolist() == kept.tolist()
+    assert "outside the sensor of 640x480" in caplog.text
+
+
+def test_a_header_without_its_end_before_a_word_that_begins_like_one(tmp_path):
+    pytest.importorskip("faery")
+    events = [((0x25 << 6) + 100 * k, 3, 4, k % 2) for k in range(500)]
+    assert evt_words("2.0", events)[:1] == b"%"
+    header = b"% evt 2.0\n% geometry 640x480\n"
+    recording = open_recording(write(tmp_path / "a.raw", header + evt_words("2.0", events)))
+    assert concatenate([*recording.events()]).t.tolist() == [t for t, *_ in events]
+    assert recording.triggers() is None
 
 
 @pytest.mark.parametrize("first", [100, 4093 << 12, 4094 << 12, (4095 << 12) + 7])
@@ -1743,6 +1821,9 @@ def test_hdf5_of_v2e_and_of_metavision(tmp_path):
             rows[name] = column
         file["CD/events"] = rows
         file.attrs["geometry"] = "320x240"
+    check(path, size=None)
+    with h5py.File(path, "a") as file:
+        file.attrs["geometry"] = np.bytes_("320x240")
     check(path, size=None)
     with h5py.File(path, "w") as file:
         file["events"] = np.zeros((5, 3))

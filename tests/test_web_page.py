@@ -112,6 +112,7 @@ TEXTS = {
     "whole.csv": "p,x,y,t\n1,3,4,1000\n0,9,5,2500\n\n",
     "names.txt": "# t x y p\n1000 3 4 +1\n2500 9 5 -1\n",
     "windows.txt": "\ufeff% made elsewhere\r\n1000\t3\t4\t1\r\n2500\t9\t5\t0",
+    "metavision.csv": "%geometry:40,30\n3,4,1,1000\n9,5,0,2500\n",
     "exponent.txt": "1e-3 3 4 1\n25e-4 9 5 0\n",
 }
 READ = """
@@ -166,6 +167,14 @@ def test_text_that_is_none_is_named_by_the_page(tmp_path, monkeypatch):
     found = read_by_the_page(*bad)
     for name, (_, line) in bad.items():
         assert found[name].startswith(f"{name}, {line}: expected t x y p"), found[name]
+
+
+def test_columns_that_are_none_are_named_by_the_page(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, text in {"part.txt": "0.1 1.5 2 1\n", "other.txt": "0.1 1 2 7\n"}.items():
+        Path(name).write_text(text)
+        found = read_by_the_page(name)[name]
+        assert found.startswith(f"{name}, event 0: expected t x y p, found"), found
 
 
 def test_a_page_without_its_runtime_says_what_to_install(tmp_path, capsys, monkeypatch):

@@ -157,7 +157,8 @@ def run(settings: Live) -> None:
     begun = time.monotonic()
     if settings.seconds is not None:
         source = source._replace(arrivals=_first(settings.seconds, source.arrivals))
-    limits = Limits(count, round(1000 * settings.longest), settings.behind)
+    speed = settings.speed if settings.replay else 1.0
+    limits = Limits(count, round(1000 * settings.longest), settings.behind, speed)
     shown = pictures(source, weights, limits, figures, settings.display, prepare)
     try:
         for picture in shown:

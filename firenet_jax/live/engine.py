@@ -10,7 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import jax
@@ -37,6 +37,7 @@ class Limits(NamedTuple):
     count: int  # events in one
     longest: int  # microseconds of one
     behind: int = 2  # that may wait
+    speed: float = 1.0  # of the events' time, in that of the clock
 
 
 class Arrived(NamedTuple):
@@ -77,10 +78,14 @@ def sound(
 
     Raises RecordingError where most of the first thousand are none.
     """
-    last = None
+    last, shift, behind = None, 0, 0
     for events in arrivals:
         if len(events):
             last = int(events.t[0]) if last is None else last
+            behind = behind + len(events) if int(events.t.max()) + shift < last else 0
+            if behind >= BAD_AFTER:  # the sender's clock was set: its times go on from the last one
+                shift, behind = last + 1 - int(events.t[0]), 0
+            events = replace(events, t=events.t + shift) if shift else events
             latest = np.maximum.accumulate(np.maximum(events.t, last))
             inside = (events.x >= 0) & (events.y >= 0) & (events.x < width) & (events.y < height)
             good = inside & (events.t >= latest)
@@ -124,11 +129,12 @@ def windows(
     count: int,
     longest: int,
     clock: Callable[[], float] = time.monotonic,
+    speed: float = 1.0,
 ) -> Iterator[Arrived]:
     """Arrivals -> windows of `count` events, or what came in `longest` microseconds.
 
-    Time is that of the events, and where none come that of the clock: the last ones before a pause
-    do not wait for its end. The last window may hold fewer.
+    Time is that of the events, and where none come that of the clock, `speed` times as fast: the
+    last ones before a pause do not wait for its end. The last window may hold fewer.
     """
     held, size, began, arrived = [], 0, 0.0, 0.0
     for events in arrivals:
@@ -142,7 +148,7 @@ def windows(
                 stop = min(count, int(np.searchsorted(whole.t, whole.t[0] + longest)))
                 yield Arrived(whole.select(slice(stop)), now)
                 held, size, began = [whole.select(slice(stop, None))], size - stop, now
-        elif size and 1e6 * (now - began) >= longest:
+        elif size and 1e6 * (now - began) * speed >= longest:
             yield Arrived(concatenate(held), arrived)
             held, size = [], 0
         held = held if size else []
@@ -223,7 +229,7 @@ def pictures(
 
     waiting = Waiting(limits.behind, figures)
     arrivals = prepare(sound(source.arrivals, height, width, figures))
-    cut = windows(arrivals, limits.count, limits.longest)
+    cut = windows(arrivals, limits.count, limits.longest, speed=limits.speed)
     reading = threading.Thread(target=waiting.fill, args=(cut,), daemon=True)
     reading.start()
     try:

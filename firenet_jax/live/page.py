@@ -11,6 +11,7 @@ somebody else's sent here under another name.
 import contextlib
 import io
 import json
+import sys
 import threading
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -143,7 +144,13 @@ def serve(board: Board, figures: Callable[[], dict], title: str, port: int) -> T
 
     escaped = title.replace("&", "&amp;").replace("<", "&lt;")
     page = PAGE.replace("TITLE", escaped).encode()
-    server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+
+    class Server(ThreadingHTTPServer):
+        def handle_error(self, request, client_address):
+            if not isinstance(sys.exc_info()[1], ConnectionError):  # the browser went away
+                super().handle_error(request, client_address)
+
+    server = Server(("127.0.0.1", port), Handler)
     server.daemon_threads = True
     threading.Thread(target=server.serve_forever, daemon=True).start()
     return server

@@ -15,6 +15,7 @@ converters and camera programs can feed this one; text is what everything can wr
 import contextlib
 import importlib
 import io
+import os
 import select
 import socket
 import sys
@@ -65,13 +66,13 @@ def replay(
     come as fast as they can be read. A pause, as of a clock that was set while it recorded,
     lasts no longer than an hour.
     """
-    begun, first, latest, shift, last = clock(), None, None, 0, 0
+    begun, first, latest, shift, last = clock(), None, None, 0, None
     part = max(1, round(1e6 * SLICE * speed))  # microseconds of the recording in a slice
     for _ in range(repeat):
         beginning = True
         for chunk in recording.events():
             first = int(chunk.t[0]) if first is None else first
-            if beginning and last:
+            if beginning and last is not None:
                 shift = last + part - int(chunk.t[0])
             beginning = False
             t = chunk.t + shift
@@ -154,6 +155,8 @@ def growing(path: Path) -> Iterator[bytes]:
         while True:
             piece = file.read(PIECE)
             if not piece:
+                if os.fstat(file.fileno()).st_size < file.tell():
+                    raise RecordingError(f"{path}: was begun anew by its writer: start again")
                 time.sleep(TICK)
             yield piece
 
@@ -170,9 +173,18 @@ def decoded(pieces: Iterable[bytes], wire: str, datagrams: bool = False) -> Iter
     decode = _Text() if wire == "text" else _Binary(BINARY[wire])
     rest = b""
     for piece in pieces:
+        if piece and datagrams and wire == "text":
+            piece += b"\n"  # the last line of a datagram may lack its end
         events, rest = decode(rest + piece) if piece else (NO_EVENTS, rest)
         rest = b"" if datagrams else rest
+        if len(rest) > PIECE:
+            raise RecordingError(
+                f"the stream holds a line of more than {PIECE} bytes where lines of t x y p were "
+                f"expected: is --wire right? It may be {', '.join(BINARY)}"
+            )
         yield events
+    if rest and wire == "text":  # so may that of a stream
+        yield decode(rest + b"\n")[0]
 
 
 class _Binary:

@@ -308,8 +308,11 @@ def unwrap(counter: np.ndarray, bits: int, last: int) -> np.ndarray:
     ones are left as they are, for `events.checked` to judge.
     """
     counter = np.asarray(counter, np.int64)
-    falls = np.diff(counter, prepend=last & ((1 << bits) - 1)) < -(1 << (bits - 1))
-    return counter + (((last >> bits) + np.cumsum(falls)) << bits)
+    whole = 1 << bits
+    steps = np.diff(counter, prepend=last & (whole - 1))
+    turns = (last >> bits) + np.cumsum(steps < -(whole // 2))
+    back = (steps > whole - (whole >> 8)) & (turns > 0)  # late, from before the last wrap
+    return counter + ((turns - np.cumsum(back)) << bits)
 
 
 def extra(module: str, path: Path) -> ModuleType:

@@ -48,7 +48,7 @@ def read(path: Path) -> Source:
             f"{path}: holds entries of type 0x{kind[0]:02X} and {kind[1]} bytes, expected 0x00 or "
             "0x0C, which are events, and 8"
         )
-    version = re.search(r"^% Version (\d+)", header, re.M)
+    version = re.search(r"^%\s*Version[ :=]+(\d+)", header, re.M)
     version = int(version[1]) if version else 0
     if version not in VERSIONS:
         raise RecordingError(f"{path}: is of version {version}, expected 0, 1 or 2")
@@ -65,7 +65,11 @@ def read_header(file: BufferedReader) -> str:
     them."""
     header = ""
     while file.peek(1)[:1] == b"%":
-        line = file.readline(1 << 16).decode("latin-1")
+        start, raw = file.tell(), file.readline(1 << 16)
+        if re.search(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]", raw):  # a word that begins with %
+            file.seek(start)
+            break
+        line = raw.decode("latin-1")
         header += line
         if line.strip() == "% end":
             break
@@ -76,7 +80,8 @@ def header_size(header: str) -> tuple[int, int] | None:
     """`% geometry 640x480`, `% format EVT3;height=480;width=640`, or `% Width 640` -> (480, 640)"""
     if match := re.search(r"geometry[ =:](\d+)x(\d+)", header, re.I):
         return int(match[2]), int(match[1])
-    height, width = (re.search(rf"\b{side}[ =](\d+)", header, re.I) for side in ("height", "width"))
+    sides = "height", "width"
+    height, width = (re.search(rf"\b{side}[ :=]+(\d+)", header, re.I) for side in sides)
     return (int(height[1]), int(width[1])) if height and width else None
 
 

@@ -12,6 +12,18 @@ import numpy as np
 from firenet_jax.readers import unwrap
 
 
+def decode(high: int, words: np.ndarray) -> tuple[int, tuple[np.ndarray, ...]]:
+    """As `triggers`, of the events: the time high after them, (t, x, y, p) int64."""
+    kind, load = words >> 28, (words & 0xFFFFFFF).astype(np.int64)
+    is_high = kind == 0x8
+    highs = np.append(high, unwrap(load[is_high], 28, max(high, 0)))
+    now = highs[np.cumsum(is_high)]
+    at = np.flatnonzero((kind < 2) & (now >= 0))
+    load = load[at]
+    t = (now[at] << 6) + (load >> 22)
+    return int(highs[-1]), (t, load >> 11 & 0x7FF, load & 0x7FF, kind[at])
+
+
 def triggers(high: int, words: np.ndarray) -> tuple[int, tuple[np.ndarray, ...]]:
     """The time high so far, -1 where it is not known yet, (N,) uint32 -> the time high after them,
     (times, ids, polarity), int64: microseconds, input, 0 or 1. Edges before the first time high are

@@ -60,12 +60,16 @@ def read(path: Path) -> Source:
         size = file.attrs.get("sensor_resolution")
         if size is not None:
             size = _resolution(path, size)
-        elif match := re.fullmatch(r"(\d+)x(\d+)", str(file.attrs.get("geometry", ""))):
+        elif match := re.fullmatch(r"(\d+)x(\d+)", _text(file.attrs.get("geometry", ""))):
             size = int(match[2]), int(match[1])
     if size is None and frames is not None:
         size = frames.read(0).shape
     grey = layout == "Metavision"  # Prophesee's sensors are monochrome
     return Source(f"HDF5 ({layout})", lambda: _events(path, layout), size, count, frames, grey)
+
+
+def _text(value: Any) -> str:
+    return value.decode("latin-1") if isinstance(value, bytes) else str(value)
 
 
 @contextmanager
@@ -154,7 +158,8 @@ def _reader(path: Path, file: Any, layout: str) -> tuple[Read, int]:
 def _check_stored(path: Path, data: Any):
     """Refuses data that lies in other files: whoever made this file would choose which are read.
     Imports hdf5plugin, which registers further compressions, where h5py alone lacks one."""
-    if data.external:
+    # a link to another file, and a virtual data set, would do the same
+    if data.external or data.is_virtual or Path(data.file.filename) != path:
         raise RecordingError(
             f"{path}: {data.name} is stored in other files: use a file that holds all its data"
         )

@@ -116,7 +116,8 @@ def _files(path: Path) -> list[Path]:
     """The files that a folder's metadata.yaml names, in its order, or all if it names none; no file
     if one is missing."""
     text = (path / "metadata.yaml").read_bytes().decode("utf-8", "replace")
-    names = dict.fromkeys(re.findall(r"[^\s/'\"]+\.(?:mcap|db3)\b", text))
+    listed = re.findall(r"(?m)(?:^\s*-|\bpath:)\s+(['\"]?)(.+?\.(?:mcap|db3))\1\s*$", text)
+    names = dict.fromkeys(name.rpartition("/")[2] for _, name in listed)
     files = [path / name for name in names] or sorted(
         file for file in path.iterdir() if file.suffix in (".mcap", ".db3")
     )
@@ -225,8 +226,9 @@ def _events(path: Path, topic: str, arrays: bool) -> Iterator[Events | Rows]:
 def _placed(path: Path, messages: Iterator[tuple[int, bytes]]) -> Iterator[bytes]:
     """The bytes of messages. `storage.progress` follows the positions of open files, but SQLite
     leaves none that tells how much it has read: a file handle of our own moves in its stead."""
-    largest = max(_files(path) if path.is_dir() else [path], key=lambda file: file.stat().st_size)
-    if largest.suffix.lower() != ".db3":
+    files = _files(path) if path.is_dir() else [path]  # none of a bag that is compressed as a whole
+    largest = max(files, key=lambda file: file.stat().st_size, default=path)
+    if largest.suffix.lower() != ".db3" or largest.is_dir():
         yield from (raw for _, raw in messages)
         return
     with open(largest, "rb", buffering=0) as handle:

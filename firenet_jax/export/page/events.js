@@ -116,12 +116,14 @@ function fromText(bytes, name) {
     const value = Number(word || NaN);
     return Number.isNaN(value) && /^(false|true)$/i.test(word) ? Number(word.length === 4) : value;
   };
-  let [first, width, height, order, columns] = [0, 0, 0, [0, 1, 2, 3], 4];
+  let [first, width, height, order, columns, geometry] = [0, 0, 0, [0, 1, 2, 3], 4];
   for (; first < lines.length; first++) {
     const found = words(lines[first]);
     const named = words(lines[first].replace(/^[#%\s]+/, "")).map((word) => column(word.toLowerCase()));
     if (found.length === 2 && found.every((word) => /^\d+$/.test(word))) [width, height] = found.map(Number);
-    else if ([..."txyp"].every((key) => named.includes(key))) {
+    else if ((geometry = /^%geometry:(\d+),(\d+)/.exec(lines[first].trim()))) { // Metavision's own order
+      [width, height, order] = [Number(geometry[1]), Number(geometry[2]), [3, 0, 1, 2]];
+    } else if ([..."txyp"].every((key) => named.includes(key))) {
       order = [..."txyp"].map((key) => named.indexOf(key));
       columns = named.length;
     } else if (/^[#%]|^$/.test(found[0])) continue;
@@ -154,6 +156,8 @@ function checked({ t, x, y, p, width, height }, name) {
     if (n && t[n] < t[n - 1]) throw new Error(`${name}, event ${n}: its time goes back`);
     if (!(x[n] >= 0 && y[n] >= 0 && x[n] < 32768 && y[n] < 32768))
       throw new Error(`${name}, event ${n}: outside of any sensor`);
+    if (x[n] % 1 || y[n] % 1 || ![-1, 0, 1].includes(Number(p[n])))
+      throw new Error(`${name}, event ${n}: expected t x y p, found ${[t[n], x[n], y[n], p[n]]}`);
     right = Math.max(right, x[n]);
     bottom = Math.max(bottom, y[n]);
   }
