@@ -148,7 +148,7 @@ def stand_ins(tmp_path_factory):
             picture.save(folder / name / f"{n}.png")
     write_video(folder / "clip.mp4", rng.integers(0, 256, (5, HEIGHT, WIDTH), np.uint8), fps=30)
     (folder / "times.txt").write_text("0.1\n0.2\n0.3\n")
-    (folder / "frames_of_another_camera.txt").write_text("5.2\n5.4\n5.6\n")  # near frames
+    (folder / "near_frames.txt").write_text("5.2\n5.4\n5.6\n")
     call("export", "-o", folder / "published.pth")
     call("export", "-o", folder / "model.stablehlo")
     call("export", "-o", folder / "firenet.onnx", "--picture")
