@@ -14,6 +14,8 @@ from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.events import MAX_TIME, Events, Recording, until_damage
 from firenet_jax.storage.files import check_no_pipe, check_readable
 
+LEARN_FROM = 5_000_000  # events among which hot pixels are looked for
+
 
 def check_span(start: float | None, stop: float | None) -> None:
     """Raises SettingsError unless these bounds in seconds, None for no bound, are valid."""
@@ -59,7 +61,7 @@ def turned(chunks: Iterable[Events], height: int, width: int) -> Iterator[Events
         yield replace(events, x=width - 1 - events.x, y=height - 1 - events.y)
 
 
-def find_hot_pixels(recording: Recording, most: int = 5_000_000) -> np.ndarray:
+def find_hot_pixels(recording: Recording, most: int = LEARN_FROM) -> np.ndarray:
     """Recording -> (H, W) bool: the hot pixels, found in the first events.
 
     A hot pixel fires alone: at least 10 times as often as the median of its 5x5 neighbourhood, and

@@ -158,7 +158,7 @@ def _from_file(path: Path, wanted: Times, recording: Recording) -> np.ndarray:
 
     found = []
     for name in units:
-        scaled = _scaled(path, numbers, name)
+        scaled = _scaled(numbers, name)
         for relative in origins:
             times = scaled + first if relative else scaled
             inside = int(((times >= first) & (times <= last)).sum())
@@ -238,7 +238,7 @@ def _header(line: str, column: int, unit: str | None, since_start: bool | None):
     return column, named.pop() if len(named) == 1 else unit, since_start
 
 
-def _scaled(path: Path, numbers: list[str], unit: str) -> np.ndarray:
+def _scaled(numbers: list[str], unit: str) -> np.ndarray:
     """Decimal numbers -> int64 microseconds, correctly rounded; at most MAX_TIME from 0."""
 
     def scaled(number: str) -> int:

@@ -19,7 +19,7 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, concatenate
-from firenet_jax.filters import hot_pixels_of
+from firenet_jax.filters import LEARN_FROM, hot_pixels_of
 from firenet_jax.live.sources import Source
 from firenet_jax.network import Weights
 from firenet_jax.pictures import Display
@@ -28,7 +28,6 @@ from firenet_jax.tensors import capacity, pack
 
 LATENCIES_KEPT = 2000  # latencies, of which median and 95th percentile are told
 BAD_AFTER = 1000  # events, of which most may not be bad at the start
-LEARN_FROM = 5_000_000  # events, as in `filters.find_hot_pixels`
 
 
 class Limits(NamedTuple):
