@@ -36,7 +36,7 @@ from firenet_jax.events import (
     until_damage,
 )
 from firenet_jax.settings import LONGEST_SIDE
-from firenet_jax.storage.files import check_readable, forbidden
+from firenet_jax.storage.files import check_no_pipe, check_readable, forbidden
 
 # In the order in which they are asked.
 FORMATS = (
@@ -111,10 +111,7 @@ def _source(path: Path, sensor_size: tuple[int, int] | None, columns: str | None
     """What the first format that knows the file reads from it."""
     if not path.exists():
         raise RecordingError(f"{path}: there is no such file or folder: check the path")
-    if not (path.is_file() or path.is_dir()):
-        raise RecordingError(
-            f"{path}: is a pipe or device, but a recording is read more than once: make it a file"
-        )
+    check_no_pipe(path, RecordingError)
     check_readable(path, RecordingError)
     if path.is_file() and path.stat().st_size == 0:
         raise RecordingError(f"{path}: the file is empty: copy or download it again")

@@ -1,7 +1,7 @@
-"""EVT2 words -> edges at the trigger inputs: the plain stream of Prophesee's sensors, 32 bits each.
+"""EVT2 words -> events, edges at trigger inputs: Prophesee's plain stream, 32 bits each.
 
 bits 31-28   bits 27-0
-0x0, 0x1  event      low time (bits 27-22), x (21-11), y (10-0); not read here, but by faery
+0x0, 0x1  event      low time (bits 27-22), x (21-11), y (10-0); read here where faery ends
 0x8  time high       bits 33-6 of the time, microseconds, which wraps around after 4.8 hours
 0xA  trigger         low time (bits 27-22), input (12-8), edge (bit 0): 1 rises
 others               vendor's data
@@ -14,24 +14,23 @@ from firenet_jax.readers import unwrap
 
 def decode(high: int, words: np.ndarray) -> tuple[int, tuple[np.ndarray, ...]]:
     """As `triggers`, of the events: the time high after them, (t, x, y, p) int64."""
-    kind, load = words >> 28, (words & 0xFFFFFFF).astype(np.int64)
-    is_high = kind == 0x8
-    highs = np.append(high, unwrap(load[is_high], 28, max(high, 0)))
-    now = highs[np.cumsum(is_high)]
-    at = np.flatnonzero((kind < 2) & (now >= 0))
-    load = load[at]
-    t = (now[at] << 6) + (load >> 22)
-    return int(highs[-1]), (t, load >> 11 & 0x7FF, load & 0x7FF, kind[at])
+    high, t, kind, load = _timed(high, words, 0x0, 0x1)
+    return high, (t, load >> 11 & 0x7FF, load & 0x7FF, kind)
 
 
 def triggers(high: int, words: np.ndarray) -> tuple[int, tuple[np.ndarray, ...]]:
     """The time high so far, -1 where it is not known yet, (N,) uint32 -> the time high after them,
     (times, ids, polarity), int64: microseconds, input, 0 or 1. Edges before the first time high are
     left out."""
+    high, t, _, load = _timed(high, words, 0xA)
+    return high, (t, load >> 8 & 0x1F, load & 1)
+
+
+def _timed(high: int, words: np.ndarray, *kinds: int):
+    """The time high after them; times, kinds and loads of the words of these kinds."""
     kind, load = words >> 28, (words & 0xFFFFFFF).astype(np.int64)
     is_high = kind == 0x8
     highs = np.append(high, unwrap(load[is_high], 28, max(high, 0)))
     now = highs[np.cumsum(is_high)]
-    edges = np.flatnonzero((kind == 0xA) & (now >= 0))
-    load = load[edges]
-    return int(highs[-1]), ((now[edges] << 6) + (load >> 22), load >> 8 & 0x1F, load & 1)
+    at = np.flatnonzero(np.isin(kind, kinds) & (now >= 0))
+    return int(highs[-1]), (now[at] << 6) + (load[at] >> 22), kind[at], load[at]
