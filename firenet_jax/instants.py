@@ -54,7 +54,7 @@ class Counts:
 
     seen: int = 0
     early: int = 0  # before the first event
-    late: int = 0  # after the last event; 0 for an endless grid, 1 for other endless iterators
+    late: int = 0  # after the last event; 1 for endless ones, but 0 for a grid with an image
 
     @property
     def outside(self) -> str:
@@ -84,25 +84,24 @@ def steps(
     time = next(times, None)
     before = Events.empty()
     for window, begin, end in _spans(windows, iter(cutter)):
-        last = int(window.events.t[-1]) if len(window.events) else end
-        pause = grid is not None and end - last > MAX_GAP  # there may be billions of times in it
+        pause = None if grid is None else _pause(window.events, end)
         if grid is not None and time is not None and time < begin:
             counts.early += grid.skip(begin)
         while time is not None and time < begin:  # only before the first window
             counts.early += 1
             time = next(times, None)
-        while time is not None and time < (last + 1 if pause else end):
+        while time is not None and time < (end if pause is None else pause[0] + 1):
             yield _look(recording, windows, before, window.events, begin, int(time))
             counts.seen += 1
             time = next(times, None)
         yield Step(window.events, None, 1.0)
         before = window.events
-        if pause:
+        if pause is not None:
             raise RecordingError(
-                f"{recording.path}: no event from {last / 1e6:.6f} to {end / 1e6:.6f} s, more than "
-                "an hour: leave one side out with --start or --stop, or use --at"
+                f"{recording.path}: no event from {pause[0] / 1e6:.6f} to {pause[1] / 1e6:.6f} s, "
+                "more than an hour: leave one side out with --start or --stop, or use --at"
             )
-    if time is not None and grid is None:
+    if time is not None and (grid is None or not counts.seen):
         counts.late += 1 + (sum(1 for _ in times) if sized else 0)
 
 
@@ -186,6 +185,16 @@ def _spans(windows: Windows, cutter: Iterator[Window]) -> Iterator[tuple[Window,
 def _span(windows: Windows) -> Fraction:
     """Microseconds per window, for windows in time."""
     return Fraction(str(windows.duration)) * 1000
+
+
+def _pause(events: Events, end: int) -> tuple[int, int] | None:
+    """Where no event comes for more than an hour, between two of a window's or after its last one:
+    a grid may have billions of times there. None: nowhere."""
+    times = np.append(events.t, end)
+    if times[-1] - times[0] <= MAX_GAP:
+        return None
+    places = np.flatnonzero(np.diff(times) > MAX_GAP)
+    return (int(times[places[0]]), int(times[places[0] + 1])) if places.size else None
 
 
 def _look(

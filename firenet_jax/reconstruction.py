@@ -6,6 +6,7 @@ recording can be streamed in chunks of any T. B recordings of different lengths 
 are steps whose new state is discarded (instants.py).
 """
 
+import copy
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +22,7 @@ from firenet_jax import colour, native
 from firenet_jax.devices import BATCH, REPLICATED, TIME_BATCH, on_each_device
 from firenet_jax.errors import logger
 from firenet_jax.events import Events, Recording, check_recording
-from firenet_jax.instants import WARM_UP, Counts, Step, check, steps, warming
+from firenet_jax.instants import WARM_UP, Counts, Grid, Step, check, steps, warming
 from firenet_jax.network import (
     BINS,
     CHANNELS,
@@ -337,6 +338,7 @@ def images_at(
     committed = Committed(state, state)
     first, cutter = warming(cut(recording, chosen), recording.pixels, warm_up)
     counts = Counts()
+    times = copy.copy(times) if isinstance(times, Grid) else times  # a grid counts on
     entries = itertools.chain(first, steps(recording, chosen, times, cutter, counts))
     for group in in_groups(entries, chunk):
         rows = [[step.events] for step in group] + [[Events.empty()]] * (chunk - len(group))

@@ -71,13 +71,15 @@ def pack(
     size: padded length, at least the number of events; None: `capacity` of that number.
     bounds: (T, B, 2) int64 microseconds, t_min and t_max of each window; None: the times of its
     first and last event.
-    Raises ValueError if rows are missing or of unequal length, if the events do not fit into
-    `size`, or if there are 2^15 windows or more.
+    Raises ValueError if rows are missing or of unequal length, if times are not whole microseconds,
+    if the events do not fit into `size`, or if there are 2^15 windows or more.
     """
     if not windows or not windows[0] or {len(row) for row in windows} != {len(windows[0])}:
         raise ValueError("windows are T rows of B windows each, T and B at least 1")
     shape = len(windows), len(windows[0])
     flat = [window for row in windows for window in row]
+    if any(window.t.dtype.kind == "f" for window in flat):  # seconds would all become one time
+        raise ValueError("times of events are whole microseconds, int64: make them by Events.of")
     counts = np.array([len(window) for window in flat])
     size = capacity(counts.sum()) if size is None else size
     if counts.sum() > size:

@@ -62,6 +62,8 @@ class Windows:
                 raise SettingsError(
                     f"{name} is {value}, but must be more than 0, at most {MAX_NUMBER}"
                 )
+        if self.events is not None and self.events != int(self.events):
+            raise SettingsError(f"events is {self.events}, but counts them: pass a whole number")
         if self.step is not None:
             if self.frame_to_frame:
                 raise SettingsError(
@@ -84,7 +86,7 @@ class Windows:
     def count(self, pixels: int) -> int:
         """Events in a full window of a sensor with this many pixels (windows in time ignore it)."""
         if self.events is not None:
-            return self.events
+            return int(self.events)  # 1e4 is a number of events, too
         return max(1, round((self.events_per_pixel or 0.35) * pixels))
 
 

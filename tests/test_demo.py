@@ -4,6 +4,7 @@ import av
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 
 from firenet_jax import cli
 from firenet_jax.checkpoint import save_weights
@@ -51,6 +52,19 @@ def test_a_link_stays_and_what_it_points_to_is_written(tmp_path, weights):
     link.symlink_to(target)
     run(Demo(link, weights, **SMALL))
     assert link.is_symlink() and len(list(target.glob("frame_*.png"))) == 15
+
+
+def test_brightness_does_not_jump_where_the_next_windows_are_simulated(
+    tmp_path, weights, monkeypatch
+):
+    found = []
+    for at_once in (15, 4):
+        monkeypatch.setattr(demo, "WINDOWS_AT_ONCE", at_once)
+        out = tmp_path / str(at_once)
+        run(Demo(out, weights, **SMALL))
+        paths = sorted(out.glob("*.png"))
+        found.append([np.asarray(Image.open(path), int)[:, 48:96] for path in paths])
+    np.testing.assert_allclose(*found, atol=1)
 
 
 def test_the_same_seed_gives_the_same(tmp_path, weights):

@@ -330,6 +330,15 @@ def test_seconds_are_no_times(weights, recording, caplog):
     assert "1 before its first event, 1 after its last one" in caplog.text
 
 
+def test_a_grid_can_be_used_again_and_one_that_begins_too_late_is_told(weights, recording, caplog):
+    times = grid(FIRST, 1000)
+    found = [list(images_at(weights, recording, times, chunk=4, events=90)) for _ in range(2)]
+    np.testing.assert_array_equal(*(np.concatenate([t for t, _ in each]) for each in found))
+    assert found[0] and not caplog.text
+    assert not list(images_at(weights, recording, grid(2 * FIRST, 1000), chunk=4, events=90))
+    assert "0 before its first event, 1 after its last one" in caplog.text
+
+
 def at_times(t):
     return Events.of(t, t * 0, t * 0, t % 2)
 
@@ -342,6 +351,9 @@ def test_a_rate_does_not_fill_a_pause_of_more_than_an_hour():
         for entry in steps(recording, Windows(events=100), grid(0, 1000), counts=counts):
             found.append(entry)
     assert [s.time for s in found if s.time is not None] == list(range(0, 100_000, 1000))
+    with pytest.raises(RecordingError, match="no event from 0.099900 to 10000000.000000 s"):
+        for entry in steps(recording, Windows(events=90), grid(0, 1000)):  # it is within a window
+            assert entry.time is None or entry.time < 100_000
     asked = [500, 10**12, 10**13 + 50_000]
     looks = [s.time for s in steps(recording, Windows(events=100), asked) if s.time is not None]
     assert looks == asked

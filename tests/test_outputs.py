@@ -98,6 +98,16 @@ def test_bags_are_read_back(tmp_path, name, colours):
         assert inside == {"metadata.yaml", "images.ros2.db3"}
 
 
+@pytest.mark.parametrize("name", ["a long walk " * 9, "it's: 2 walks"])
+def test_a_bag_of_ros_2_may_have_any_name(tmp_path, name):
+    highlevel = pytest.importorskip("rosbags.highlevel")
+    path = tmp_path / f"{name}.ros2"
+    write(BagWriter(path, "/cam7/image_raw", "left"), pictures())
+    with highlevel.AnyReader([path]) as bag:
+        assert len(list(bag.messages())) == 5
+    assert {file.name for file in path.iterdir()} == {"metadata.yaml", f"{name}.ros2.db3"}
+
+
 OF_ROS = """
 import json, sys
 import rosbag

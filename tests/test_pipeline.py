@@ -213,6 +213,23 @@ def test_other_settings_do_not_continue_an_unfinished_run(tmp_path, weights, mon
     assert len(pictures_of(tmp_path / "out")[0]) == 15
 
 
+def test_an_unfinished_run_is_not_continued_with_pictures_of_others(tmp_path, weights, monkeypatch):
+    recording = write_recording(tmp_path / "a.txt")
+    unfinished(weights, recording, tmp_path / "out", monkeypatch)
+
+    def broken():
+        yield np.zeros((HEIGHT, WIDTH), np.uint8)
+        raise Interrupted
+
+    with pytest.raises(Interrupted):
+        fj.write_video(tmp_path / "out", broken())
+    for name in ("out", "whole"):
+        run(settings(weights, (recording,), tmp_path / name))
+    expected, actual = pictures_of(tmp_path / "whole"), pictures_of(tmp_path / "out")
+    np.testing.assert_array_equal(actual[0], expected[0])
+    assert actual[1] == expected[1]
+
+
 def test_what_an_interrupted_run_left_is_named_where_it_is_damaged(tmp_path, weights, monkeypatch):
     recording = write_recording(tmp_path / "a.txt")
     unfinished(weights, recording, tmp_path / "out", monkeypatch)
@@ -426,6 +443,13 @@ def test_the_hot_pixels_of_a_file_not_its_name_are_what_a_run_goes_on_with(
     hot.write_text("1,1\n3,4\n")
     with pytest.raises(OutputError, match="unfinished run of other settings"):
         run(settings(weights, (recording,), tmp_path / "out", hot_pixels=str(hot)))
+
+
+def test_columns_in_another_order_do_not_continue_an_unfinished_run(tmp_path, weights, monkeypatch):
+    recording = write_recording(tmp_path / "a.txt", width=HEIGHT)  # x and y may change places
+    unfinished(weights, recording, tmp_path / "out", monkeypatch)
+    with pytest.raises(OutputError, match="columns was None, now t,y,x,p"):
+        run(settings(weights, (recording,), tmp_path / "out", columns="t,y,x,p"))
 
 
 def test_names_with_dots(tmp_path, weights):

@@ -5,6 +5,7 @@ import os
 import sys
 import types
 
+import h5py
 import numpy as np
 import pytest
 from PIL import Image
@@ -111,6 +112,15 @@ def test_reconstruct_shows_what_it_writes(display, tmp_path, monkeypatch):
     assert cli.main("reconstruct a.txt -o out -N 100 --show".split()) == 0
     written = [np.asarray(Image.open(path)) for path in sorted((tmp_path / "out").glob("*.png"))]
     np.testing.assert_array_equal([image.pixels for image in shown], written)
+
+
+def test_reconstruct_shows_images_of_arrays_as_greys(display, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_recording(tmp_path / "a.txt", 500)
+    assert cli.main("reconstruct a.txt -o out.h5 -N 100 --show".split()) == 0
+    with h5py.File("out.h5") as file:
+        expected = np.rint(255 * np.clip(file["images"][:], 0, 1))
+    np.testing.assert_array_equal([image.pixels for image in shown], expected)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="has a display without saying so")

@@ -154,6 +154,12 @@ def test_what_is_no_table_of_windows_is_refused(rows):
         pack(rows)
 
 
+def test_events_in_seconds_are_refused():
+    events = random_events(np.random.default_rng(0), 10)
+    with pytest.raises(ValueError, match="whole microseconds"):
+        pack([[Events(events.t / 1e6, events.x, events.y, events.p)]])
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks")
 def test_packs_in_a_forked_process_too():
     """As workers of a data loader do: threads of the parent are not in them."""

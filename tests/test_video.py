@@ -175,6 +175,14 @@ def test_outputs_that_cannot_be(tmp_path):
     check_output(tmp_path / "movie.mp4", overwrite=True)
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes")
+@pytest.mark.parametrize("name", ["out", "out.mp4"])
+def test_a_pipe_is_no_output(tmp_path, name):
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(OutputError, match="is a pipe or device"):
+        check_output(tmp_path / name, overwrite=True)
+
+
 def test_a_dot_makes_no_file_of_a_folder(tmp_path):
     for name in ("out_0.35", "run.1"):
         check_output(tmp_path / name, overwrite=False)

@@ -187,6 +187,7 @@ def test_no_events_no_windows():
         ({"events": 5, "duration": 3}, "choose one"),
         ({"events": 0}, "more than 0"),
         ({"events": 10**400}, "at most 2147483647"),
+        ({"events": 2.5}, "whole number"),
         ({"events_per_pixel": 1e308}, "at most 2147483647"),
         ({"duration": -1}, "more than 0"),
         ({"duration": float("nan")}, "more than 0"),
@@ -199,6 +200,11 @@ def test_no_events_no_windows():
 def test_impossible_settings(fields, message):
     with pytest.raises(ValueError, match=message):
         Windows(**fields)
+
+
+def test_a_number_of_events_may_be_written_as_a_float():
+    recording = recording_of(range(9))
+    assert times_of(recording, events=4.0) == times_of(recording, events=4)
 
 
 @pytest.mark.parametrize("fields", [{"events": 5, "step": 6}, {"duration": 5, "step": 6}])

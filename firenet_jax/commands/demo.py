@@ -21,7 +21,13 @@ from firenet_jax.checkpoint import load_weights
 from firenet_jax.errors import SettingsError
 from firenet_jax.evaluation.metrics import mse, ssim, temporal_error
 from firenet_jax.network import Weights, initial_state
-from firenet_jax.pictures import Display, display, event_pictures, initial_display_state
+from firenet_jax.pictures import (
+    Display,
+    DisplayState,
+    display,
+    event_pictures,
+    initial_display_state,
+)
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.settings import check_seed, parse_size
 from firenet_jax.simulation.scenes import Scene, SceneSettings, random_scene
@@ -162,7 +168,7 @@ def pictures(
     """Yields (H, 3 W, 3) uint8, events | reconstruction | truth, with (MSE, SSIM, temporal error),
     for `count` windows of `period` microseconds."""
     state = initial_state(1, height, width)
-    sensor_state = last = None
+    sensor_state, last, ranges = None, None, initial_display_state(1)
     for start in range(0, count, WINDOWS_AT_ONCE):
         bounds = np.round(np.arange(start, start + WINDOWS_AT_ONCE + 1) * period).astype(np.int32)
         sensor_state, simulated = simulate(
@@ -173,7 +179,7 @@ def pictures(
         images = images[:, 0]
         if last is None:  # the first picture has no predecessor, so its temporal error is none
             last = images[0], simulated.images[0, 0]
-        last, shown = _show(simulated, images, last)
+        last, ranges, shown = _show(simulated, images, last, ranges)
         shown = jax.device_get(shown)
         for t in range(min(WINDOWS_AT_ONCE, count - start)):
             greys = [np.stack([grey[t]] * 3, -1) for grey in (shown.images, shown.truth)]
@@ -181,10 +187,11 @@ def pictures(
 
 
 @partial(jax.jit, static_argnames="settings")
-def _show(simulated, images, last, settings: Display = Display()):
-    """Windows of one sequence, images (T, H, W), and the last (image, truth) before them."""
+def _show(simulated, images, last, ranges: DisplayState, settings: Display = Display()):
+    """Windows of one sequence, images (T, H, W), and what came before them: the last (image, truth)
+    and the ranges that were shown."""
     tensors, truth, displacement, visible = (leaf[:, 0] for leaf in simulated)
-    _, greys = display(initial_display_state(1), images[:, None], settings=settings)
+    ranges, greys = display(ranges, images[:, None], settings=settings)
     clipped = jnp.clip(images, 0.0, 1.0)
     before = (
         jnp.concatenate([one[None], all[:-1]])
@@ -201,7 +208,7 @@ def _show(simulated, images, last, settings: Display = Display()):
     )
     eight_bit = jnp.round(jnp.clip(255 * truth, 0, 255)).astype(jnp.uint8)
     shown = Shown(event_pictures(tensors), greys[:, 0], eight_bit, errors)
-    return (clipped[-1], truth[-1]), shown
+    return (clipped[-1], truth[-1]), ranges, shown
 
 
 def captions(words: list[str], width: int) -> np.ndarray:

@@ -51,7 +51,7 @@ from firenet_jax.windows import DEFAULT_LONGEST, Windows, in_words, usual
 # Settings that are not part of a run's record: the pictures do not depend on them (on the chunk
 # only in float32's last bits), or the record holds them in another form.
 UNRECORDED = ("recordings", "output", "weights", "fps", "speed", "chunk", "batch", "overwrite")
-UNRECORDED += ("columns", "strict", "processes", "process", "show")
+UNRECORDED += ("strict", "processes", "process", "show")
 
 
 @dataclass(frozen=True)

@@ -153,7 +153,12 @@ def strange_in(folder: Path) -> str | None:
 
 def _rename_inside(folder: Path, old: str) -> None:
     """Renames the database, and in metadata.yaml: rosbags named it `images.partial.ros2.db3`."""
-    metadata = folder / "metadata.yaml"
-    text = metadata.read_text(encoding="utf-8").replace(f"{old}.db3", f"{folder.name}.db3")
-    (folder / f"{old}.db3").rename(folder / f"{folder.name}.db3")
-    metadata.write_text(text, encoding="utf-8")
+    metadata, name = folder / "metadata.yaml", f"{folder.name}.db3"
+    yaml: Any = importlib.import_module("ruamel.yaml").YAML(typ="safe")  # comes with rosbags
+    yaml.default_flow_style, yaml.width = False, 2**20  # else a long name may span lines
+    told = yaml.load(metadata.read_text(encoding="utf-8"))
+    bag = told["rosbag2_bagfile_information"]
+    bag["relative_file_paths"], bag["files"][0]["path"] = [name], name
+    (folder / f"{old}.db3").rename(folder / name)
+    with metadata.open("w", encoding="utf-8") as file:
+        yaml.dump(told, file)

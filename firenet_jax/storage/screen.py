@@ -42,9 +42,12 @@ class Screen:
         self.window.protocol("WM_DELETE_WINDOW", self.close)
 
     def show(self, picture: np.ndarray, title: str) -> None:
-        """A picture (H, W) or (H, W, 3) uint8. Returns at once, also where the window is closed."""
+        """A picture (H, W) or (H, W, 3) uint8, or an image (H, W) float32, black at 0 and white at
+        1. Returns at once, also where the window is closed."""
         if self.window is None or time.monotonic() - self.last < MIN_INTERVAL:
             return
+        if picture.dtype != np.uint8:  # of an .h5, which holds images and no pictures
+            picture = np.rint(255 * np.clip(picture, 0, 1)).astype(np.uint8)
         height, width = picture.shape[:2]
         header = f"P{5 if picture.ndim == 2 else 6} {width} {height} 255\n".encode()
         with contextlib.suppress(self.tk.TclError):  # closed meanwhile

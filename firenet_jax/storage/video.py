@@ -84,6 +84,8 @@ def check_output(path: Path, overwrite: bool) -> None:
             f"{path}: cannot write {path.suffix} files: name a folder (for png), .mp4, .gif, .h5, "
             ".bag or .ros2"
         )
+    if path.exists() and not (path.is_file() or path.is_dir()):  # a file would take its place
+        raise OutputError(f"{path} is a pipe or device: choose a name for a file or folder")
     folder = path.suffix not in WHOLE or path.suffix == ".ros2"
     if path.is_dir() and not folder:
         what = "video" if path.suffix in VIDEOS else "file"
@@ -163,6 +165,8 @@ class FolderWriter:
         """Goes on after so many pictures of an earlier run; what lies beyond is written again."""
         self.count = done
         with writing(self.path):
+            if not done:  # none goes on from where pictures are replaced
+                (self.partial / "resume.npz").unlink(missing_ok=True)
             stamps = self.stamps = (self.partial / "timestamps.txt").open("a+", newline="")
             stamps.seek(0)
             kept = list(itertools.islice(stamps, done + self.at_times if done else 0))
