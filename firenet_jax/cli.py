@@ -188,6 +188,7 @@ def main(arguments: list[str] | None = None) -> int:
     logging.basicConfig(format="firenet: %(message)s", level=logging.WARNING)
     name, rest = arguments[0], arguments[1:]
     _set_malloc(KEEP_FREED_MEMORY if name == "train" else RETURN_FREED_MEMORY)
+    os.environ["JAX_ENABLE_X64"] = "0"  # for other programs of this user: here all is float32
     module, settings, _ = COMMANDS[name]
     for option in (word.partition("=")[0] for word in rest):
         if name == "reconstruct" and option in FORMER:

@@ -183,6 +183,7 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
     steps, batch = packed.t_min.shape
     windows, plane = steps * batch, height * width
     even, odd = (BINS + 1) // 2, BINS // 2  # how many bins have even numbers and odd ones
+    one = jnp.float32(1)  # 1.0 would be float64 where a program has jax_enable_x64
     if BINS * windows * plane >= 2**31:
         raise SettingsError(
             f"{windows} windows of {width}x{height} are too many for one chunk: use a smaller one"
@@ -204,7 +205,7 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
         sums = []
         for first, (bins, planes_of) in enumerate(zip((even, odd), planes, strict=True)):
             k = jnp.floor((t_star + 1 - first) / 2)  # of bins first, first + 2, ... the one near t*
-            votes = jnp.where(p, 1.0, -1.0) * (1 - jnp.abs(2 * k + first - t_star))
+            votes = jnp.where(p, one, -one) * (1 - jnp.abs(2 * k + first - t_star))
             k = jnp.clip(k, -1, bins).astype(jnp.int32).astype(jnp.uint32)
             place = k * (windows * plane) + pixel  # indices past the end are dropped
             sums.append(planes_of.at[place].add(votes, mode="drop"))
@@ -216,7 +217,7 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
     size = packed.t.shape[0]
     block = BLOCK if jax.default_backend() == "cpu" and size % BLOCK == 0 else size
     columns = jax.tree.map(lambda column: column.reshape(-1, block), packed[:5])
-    nothing = tuple(jnp.zeros(bins * windows * plane) for bins in (even, odd))
+    nothing = tuple(jnp.zeros(bins * windows * plane, jnp.float32) for bins in (even, odd))
     planes, _ = jax.lax.scan(vote, nothing, columns, unroll=BLOCKS)
     planes = [sums.reshape(-1, 1, steps, batch, height, width) for sums in planes]
     in_order = [planes[number % 2][number // 2] for number in range(BINS)]

@@ -462,3 +462,20 @@ def test_training_keeps_its_memory():
     """In a thread, as XLA's."""
     environment = {k: v for k, v in os.environ.items() if k != "GLIBC_TUNABLES"}
     subprocess.run([sys.executable, "-c", KEEPS], env=environment, check=True)
+
+
+LONG_FLOATS = """
+import contextlib
+from firenet_jax import cli
+with contextlib.suppress(SystemExit):
+    cli.main(["reconstruct", "--help"])
+import jax
+assert jax.numpy.ones(1).dtype == "float32"
+"""
+
+
+def test_long_floats_that_jax_has_for_other_programs_are_not_used():
+    """They would end in a traceback: a step's state is float32."""
+    environment = os.environ | {"JAX_ENABLE_X64": "1"}
+    command = [sys.executable, "-c", LONG_FLOATS]
+    subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL)

@@ -310,3 +310,13 @@ def test_gradients_that_do_not_fit_together_are_not_read():
             native.gradients([image], jnp.zeros((3, 3, 16, 16)), [jnp.zeros(other)])
         with pytest.raises(Unavailable):
             native.gradients([jnp.zeros(other)], jnp.zeros((3, 3, 16, 16)), [gradient])
+
+
+def test_more_arrays_than_a_call_has_room_for_are_xlas():
+    """Their addresses would lie where threads count what is done."""
+    maps = [jnp.full((1, 5, 6, 16), 0.1 * k) for k in range(12)]
+    kernel, bias = jnp.full((3, 3, 192, 16), 0.01), jnp.zeros(16)
+    with pytest.raises(Unavailable):
+        native.convolve(maps, kernel, bias)
+    (found,) = convolution.layer(maps, kernel, bias)
+    assert_same(found, convolution._plain(jnp.concatenate(maps, -1), kernel))

@@ -147,6 +147,14 @@ def test_no_events_leave_the_image():
     np.testing.assert_array_equal(image, later)
 
 
+def test_the_surface_begins_with_the_first_event():
+    state = initial_state(HEIGHT, WIDTH)
+    empty, _ = step(state, Window(Events.empty(), 10**15 - 7_000_000), SMALL)
+    window = random_window(np.random.default_rng(4), 50)
+    found, expected = (step(s, window, SMALL)[0].surface for s in (empty, state))
+    np.testing.assert_array_equal(found, expected)
+
+
 def test_gradient_and_adjoint_equal_the_matrix():
     rng = np.random.default_rng(5)
     surface, u = rng.normal(size=(2, HEIGHT, WIDTH))

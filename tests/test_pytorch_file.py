@@ -4,11 +4,13 @@ import pickle
 import struct
 import tracemalloc
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from firenet_jax.storage import pytorch_file
 from firenet_jax.storage.pytorch_file import CheckpointError, read_state_dict
 
 # ---- a writer of both layouts that needs no PyTorch: pickles put together by instruction
@@ -290,6 +292,70 @@ def test_key_that_takes_for_ever_to_hash(file, layout):
     tree = tree.replace(b"2\x86", b"q\x01h\x01\x86")
     with pytest.raises(CheckpointError, match="damaged"):
         read_state_dict(file(layout(tree, SMALL)))
+
+
+LONG = 3000
+NOTHING = b"](" + LONG * b"N" + b"eq\x01"  # a list, which h\x01 puts onto the stack again
+STORAGE = tensor("0", 6, (6,), (1,)).partition(b"_v2\n(")[2].partition(b"Q")[0] + b"Qq\x02"
+REBUILD = b"ctorch._utils\n_rebuild_tensor_v2\nq\x03"
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        ORDERED_DICT + b"(](" + NOTHING + (LONG - 1) * b"h\x01" + b"etR",
+        b"(" + STORAGE + REBUILD + NOTHING.replace(b"N", b"K\x01")
+        + LONG * b"h\x03(h\x02K\x00h\x01h\x01tR" + b"l",
+        b"}(" + text("a" * LONG) + b"q\x01" + LONG * b"h\x01" + b"tNs",
+    ],
+    ids=["pairs", "shapes", "key"],
+)  # fmt: skip
+def test_lists_that_are_long_and_many_take_no_memory(file, layout, tree):
+    """Of n bytes n^2 numbers or characters would be made."""
+    path = file(layout(whole(tree), SMALL))
+    tracemalloc.start()
+    try:
+        with pytest.raises(CheckpointError):
+            read_state_dict(path)
+        assert tracemalloc.get_traced_memory()[1] < 5e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_keys_that_are_long_and_many_take_no_time(file, layout):
+    tuple_ = b"(" + 100 * b"K\x01" + b"tq\x01"
+    whole_number = b"\x8b" + struct.pack("<I", 100) + 100 * b"\x01" + b"q\x01"  # of 100 bytes
+    for key in (tuple_, whole_number):
+        tree = whole(b"}(", key, b"Nh\x01Nu")
+        with pytest.raises(CheckpointError, match="put into something that takes none"):
+            read_state_dict(file(layout(tree, SMALL)))
+
+
+def test_a_shape_of_long_numbers(file, layout):
+    long = b"\x8b" + struct.pack("<I", 100) + 100 * b"\x01"
+    tree = one((7,), (1,)).replace(number(7), long)
+    with pytest.raises(CheckpointError, match="a storage and whole numbers"):
+        read_state_dict(file(layout(tree, SMALL)))
+
+
+def test_instructions_without_end(file, layout, monkeypatch):
+    monkeypatch.setattr(pytorch_file, "MAX_INSTRUCTIONS", 1000)
+    assert list(read_state_dict(file(layout(TREE, STORAGES)))) == ["a", "b", "c"]
+    with pytest.raises(CheckpointError, match="more than 1000 instructions"):
+        read_state_dict(file(layout(whole(1000 * b"}"), SMALL)))
+
+
+def test_members_of_a_zip_that_overlap(file):
+    """Each holds all that follow it: of n bytes n^2 would be read."""
+    content = new_file(whole(mapping(a=tensor("0", 6, (6,), (1,)))), SMALL | {"1": bytes(4000)})
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        end = archive.start_dir
+        found = archive.getinfo("model/data/0")
+    start = found.header_offset + 30 + len(found.filename)
+    at = content.index(b"model/data/0", end) - 46  # in the list of members: checksum, two sizes
+    sizes = struct.pack("<III", zlib.crc32(content[start:end]), end - start, end - start)
+    with pytest.raises(CheckpointError, match="its members overlap each other"):
+        read_state_dict(file(content[: at + 16] + sizes + content[at + 28 :]))
 
 
 @pytest.mark.parametrize(

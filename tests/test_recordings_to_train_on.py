@@ -104,6 +104,14 @@ def test_recordings_that_cannot_be_learnt_from_are_said(tmp_path, folder):
                        coordinator="127.0.0.1:1"))  # fmt: skip
 
 
+def test_processes_of_a_launcher_do_not_write_the_same_files(tmp_path, folder, monkeypatch):
+    monkeypatch.setenv("OMPI_COMM_WORLD_RANK", "1")
+    monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", "2")
+    with pytest.raises(SettingsError, match="by one process"):
+        train.run(tiny(tmp_path / "run", data=(folder,)))
+    assert not (tmp_path / "run").exists()
+
+
 def write_pictures(path, times, events, size=24):
     """An HDF5 sequence of grey pictures at these times, in microseconds."""
     pictures = [Picture(t, np.full((size, size), k, np.uint8), None) for k, t in enumerate(times)]

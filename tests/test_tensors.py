@@ -138,6 +138,15 @@ def test_gradients_are_finite_through_an_empty_window():
     assert np.isfinite(gradient).all()
 
 
+def test_float32_where_a_program_has_long_floats():
+    events = random_events(np.random.default_rng(3), 200)
+    expected = tensor_of(events)
+    with jax.enable_x64(True):
+        found = tensor_of(events)
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, expected)
+
+
 def test_capacities_only_grow_and_are_few():
     assert capacity(1) == CAPACITIES[0]
     assert capacity(CAPACITIES[1] + 1) == CAPACITIES[2]

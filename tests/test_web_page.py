@@ -177,6 +177,18 @@ def test_columns_that_are_none_are_named_by_the_page(tmp_path, monkeypatch):
         assert found.startswith(f"{name}, event 0: expected t x y p, found"), found
 
 
+def test_times_that_are_none_are_named_by_the_page(tmp_path, monkeypatch):
+    """A window would begin there, and never end."""
+    monkeypatch.chdir(tmp_path)
+    Path("a.txt").write_text("0.1 1 2 1\nInfinity 1 2 1\n")
+    np.save("b.npy", [[np.nan, 1.0, 2.0, 1.0]])
+    np.save("c.npy", np.ones((2, 4), np.float16))
+    found = read_by_the_page("a.txt", "b.npy", "c.npy")
+    assert found["a.txt"] == "a.txt, event 1: its time is Infinity"
+    assert found["b.npy"] == "b.npy, event 0: its time is NaN"
+    assert found["c.npy"] == "c.npy: expected an array of numbers in C order"
+
+
 def test_a_page_without_its_runtime_says_what_to_install(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, _, error = firenet(capsys, "export --web page")

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.checkpoint import load_weights
+from firenet_jax.devices import share
 from firenet_jax.errors import RecordingError, SettingsError, logger
 from firenet_jax.evaluation import metrics
 from firenet_jax.evaluation.comparison import Gap
@@ -68,7 +69,7 @@ def run(settings: Train) -> None:
 
     Raises a FirenetError with a message of one sentence."""
     if settings.on_recordings:
-        if settings.processes not in (None, 1):
+        if share(settings.process, settings.processes)[1] > 1:  # a launcher's, too
             raise SettingsError(
                 "recordings are trained on by one process: make sequences of them with one, then "
                 f"name {settings.sequences} as --data"

@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import jax
 
+from firenet_jax.native.choice import Unavailable
 from firenet_jax.native.llvm import (
     INT,
     INT32,
@@ -37,6 +38,7 @@ RESOURCE_EXHAUSTED = 8
 # A call's record on the heap: how many may still use it, images, who has come, arrays; and for each
 # stage, in cache lines of their own, how many parts are done, and taken of each half.
 USERS, IMAGES, WORKERS, ARRAYS, COUNTERS, COUNTER = 0, 8, 16, 24, 128, 64
+MOST_ARRAYS = (COUNTERS - ARRAYS) // 8
 
 # Memory that the stages of a call share is kept for the next call, of whatever function: to have
 # new pages from the system takes as long as a good part of the work. One block, its size before it.
@@ -59,8 +61,11 @@ def register(
     parts: of each stage, for each image of the batch: the first axis of argument 0.
     arguments, results: how many; the stages get pointers of them, and then, if there is some, of
     scratch: bytes of memory for each image, a multiple of 64, that all stages of a call share.
-    Raises RuntimeError where XLA's interface has another version than this was written for.
+    Raises RuntimeError where XLA's interface has another version than this was written for, and
+    Unavailable for more arrays than a record has room for.
     """
+    if arguments + results + bool(scratch) > MOST_ARRAYS:
+        raise Unavailable
     work = _work(module, stages, parts)
     _handler(module, work, len(stages), parts, arguments, results, scratch)
     handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(compiled(module)("handler"))

@@ -34,6 +34,7 @@ NEARLY_NOISELESS = 2 / 3
 # half of these the polarities are random instead of alternating: their sums look like contrast.
 # Of sensors whose noise shows what is dark, only this share is equal.
 AT_REST, EQUAL_AT_REST = (0.02, 1.0), 0.4
+LONGEST_WINDOW = 3e5  # microseconds
 
 
 def check_rare(slow: float, swift: float) -> None:
@@ -42,6 +43,16 @@ def check_rare(slow: float, swift: float) -> None:
         raise SettingsError(
             f"slow is {slow} and swift is {swift}, but they are parts of the sequences: 0 or more, "
             "together less than 1"
+        )
+
+
+def check_motion(motion: tuple[float, float], renderings: int) -> None:
+    """Raises SettingsError if something moves by more than a pixel between two renderings, the
+    bound of Gehrig et al., "Video to Events", CVPR 2020."""
+    if motion[1] > renderings:
+        raise SettingsError(
+            f"windows with {motion[1]} pixels of motion need {math.ceil(motion[1])} "
+            f"renderings, not {renderings}"
         )
 
 
@@ -85,14 +96,10 @@ def random_setups(
     swift: share of the sequences with very fast motion (`SWIFT` pixels per window, more than one
     between renderings) over a plain background.
     Where the sensor has noise, half of the scenes that stop for good are noisy (`AT_REST`).
-    Raises SettingsError if `motion` is more than a pixel between two renderings, the bound of
-    Gehrig et al., "Video to Events", CVPR 2020, or if slow and swift are not valid shares.
+    Raises SettingsError if `motion` is more than a pixel between two renderings (`check_motion`),
+    or if slow and swift are not valid shares.
     """
-    if motion[1] > renderings:
-        raise SettingsError(
-            f"windows with {motion[1]} pixels of motion need {math.ceil(motion[1])} "
-            f"renderings, not {renderings}"
-        )
+    check_motion(motion, renderings)
     check_rare(slow, swift)
     scene_key, sensor_key, number_key = jax.random.split(key, 3)
     numbers = jax.random.uniform(number_key, (2, batch))
@@ -142,7 +149,7 @@ def _paces(
     pixels = log_uniform(motion, jnp.clip((kind - slow) / (1 - slow - swift), 0, 1))
     pixels = jnp.where(is_slow, log_uniform(SLOW, kind / (slow or 1)), pixels)
     pixels = jnp.where(is_swift, log_uniform(SWIFT, (kind - 1 + swift) / (swift or 1)), pixels)
-    duration = jnp.clip(1e6 * pixels / speed, 1e3, 3e5).astype(jnp.int32)
+    duration = jnp.clip(1e6 * pixels / speed, 1e3, LONGEST_WINDOW).astype(jnp.int32)
     usual = jnp.minimum(speed, 1e6 * renderings / duration)
     speed = jnp.where(is_slow | is_swift, 1e6 * pixels / duration, usual)
     return speed, duration, is_slow, is_swift

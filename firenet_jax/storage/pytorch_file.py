@@ -35,6 +35,11 @@ from firenet_jax.storage.files import check_readable
 MAGIC_NUMBER = 0x1950A86A20F9469CFC6C
 PROTOCOL = 1001
 MAX_ELEMENTS = 2**28  # 100 times the largest network of this field; a stride of 0 can claim any
+MAX_DIMENSIONS = 64  # numpy's
+MAX_KEY = 16  # items of a tuple that is a key: it is hashed anew each time
+# Of a pickle. A checkpoint with its optimiser and log has thousands; an instruction of one byte can
+# make an object of a hundred.
+MAX_INSTRUCTIONS = 2**22
 
 AGAIN = "copy or download it again"
 
@@ -168,6 +173,9 @@ def _read_old(content: bytes) -> dict[str, np.ndarray]:
 def _read_new(path: Path) -> dict[str, np.ndarray]:
     size = path.stat().st_size
     with zipfile.ZipFile(path) as archive:
+        stored = (i.file_size for i in archive.infolist() if i.compress_type == zipfile.ZIP_STORED)
+        if sum(stored) > size:  # each could be as large as the file: that fills the memory
+            raise CheckpointError(f"is damaged (its members overlap each other); {AGAIN}")
         names = set(archive.namelist())
         roots = [name.removesuffix("data.pkl") for name in names if name.endswith("/data.pkl")]
         if len(roots) != 1:
@@ -292,13 +300,18 @@ def _state_dict(tree) -> dict[str, _Tensor]:
             tensors = {k: v for k, v in items if isinstance(k, str) and isinstance(v, _Tensor)}
             if tensors:
                 return tensors
-        found = ", ".join(_shown(str(key)) for key in list(tree)[:8]) or "nothing"
+        # Only texts: what names a tuple can be of any length.
+        found = ", ".join(_named(key) for key in list(tree)[:8]) or "nothing"
     else:
         found = f"a {type(tree).__name__.lstrip('_')}"
     raise CheckpointError(
         "holds no tensors by name: expected a state dict, alone or under 'state_dict' or "
         f"'model_state_dict', found {found}; save one with torch.save(network.state_dict(), FILE)"
     )
+
+
+def _named(key) -> str:
+    return _shown(key) if isinstance(key, str) else f"a {type(key).__name__.lstrip('_')}"
 
 
 def _shown(text: str) -> str:
@@ -311,13 +324,15 @@ def _shown(text: str) -> str:
 
 
 def _ordered_dict(pairs=()) -> dict:
+    if any(len(pair) != 2 for pair in pairs):  # thousands of one long list would take gigabytes
+        raise TypeError("a dict is made of something else than pairs")
     result = {}
     _put(result, [item for pair in pairs for item in pair])
     return result
 
 
 def _size(sizes=()) -> tuple:
-    if len(sizes) > 64:  # thousands of long ones would take gigabytes
+    if len(sizes) > MAX_DIMENSIONS:  # thousands of long ones would take gigabytes
         raise TypeError(f"a tensor of {len(sizes)} dimensions")
     return tuple(sizes)
 
@@ -328,9 +343,13 @@ def _rebuild_tensor(storage: _Storage, offset, shape, strides, *_) -> _Tensor:
 
 def _rebuild_untyped(storage, offset, shape, strides, _grad, _hooks, type, *_) -> _Tensor:
     whole = isinstance(storage, _Storage) and isinstance(type, _Type) and len(shape) == len(strides)
-    if not whole or any(not isinstance(n, int) for n in (offset, *shape, *strides)):
+    shape, strides = _size(shape), _size(strides)
+    # Products of numbers of a megabyte would take for ever.
+    if not whole or any(
+        not isinstance(n, int) or n.bit_length() > 64 for n in (offset, *shape, *strides)
+    ):
         raise TypeError("a tensor is not made of a storage and whole numbers")
-    return _Tensor(type, storage, offset, tuple(shape), tuple(strides))
+    return _Tensor(type, storage, offset, shape, strides)
 
 
 def _rebuild_parameter(tensor, *_):
@@ -423,10 +442,14 @@ def _storage(storages: dict[str, _Storage], pid) -> _Storage:
 
 
 def _plain(key) -> bool:
-    """Whether hashing is quick: a tuple of tuples of tuples can take for ever."""
+    """Whether hashing is quick: a tuple of tuples of tuples can take for ever, and so can a long
+    tuple or number that is a key thousands of times."""
     if isinstance(key, tuple):
-        return all(not isinstance(item, tuple) and _plain(item) for item in key)
-    return key is None or isinstance(key, str | bytes | int | float | _Inert)
+        short = len(key) <= MAX_KEY
+        return short and all(not isinstance(item, tuple) and _plain(item) for item in key)
+    if isinstance(key, int):
+        return key.bit_length() <= 64
+    return key is None or isinstance(key, str | bytes | float | _Inert)
 
 
 def _put(target, items: list) -> None:
@@ -481,7 +504,9 @@ def _unpickle(stream: io.BytesIO, storages: dict[str, _Storage]):
         return items
 
     arg: Any
-    for opcode, arg, _position in pickletools.genops(stream):
+    for number, (opcode, arg, _position) in enumerate(pickletools.genops(stream)):
+        if number == MAX_INSTRUCTIONS:
+            raise ValueError(f"a pickle of more than {MAX_INSTRUCTIONS} instructions")
         match opcode.name:
             case "BINUNICODE" | "SHORT_BINUNICODE" | "BINUNICODE8" | "UNICODE":
                 stack.append(arg)

@@ -15,7 +15,7 @@ import tyro
 from firenet_jax.devices import check_processes
 from firenet_jax.errors import SettingsError
 from firenet_jax.settings import check_range, check_seed
-from firenet_jax.simulation.curricula import check_rare
+from firenet_jax.simulation.curricula import LONGEST_WINDOW, check_motion, check_rare
 from firenet_jax.simulation.scenes import SceneSettings
 from firenet_jax.simulation.sensor import FAULTY, SensorSettings
 from firenet_jax.training.batches import Augment, is_set
@@ -24,6 +24,7 @@ from firenet_jax.training.step import StepSettings
 
 Block = Literal["head", "gru1", "res1", "gru2", "res2", "prediction"]
 MIN_CROP = 11  # pixels on a side of what validation measures: SSIM's window
+MIN_CROP_CW_SSIM = 17  # what the filters of CW-SSIM need
 
 
 @dataclass(frozen=True)
@@ -145,6 +146,7 @@ class Train:
                 f"crop is {self.crop} pixels, but images smaller than {MIN_CROP} cannot be judged"
             )
         check_range("motion", self.motion)
+        _check_step(self)
         check_rare(self.slow, self.swift)
         if not 0 <= self.to_and_fro <= 1:
             raise SettingsError(
@@ -184,6 +186,24 @@ class Train:
         chosen: dict[str, Any] = {name: getattr(self, name) for name in names}
         chosen["warmup"] = warming_up(self)
         return StepSettings(**chosen)
+
+
+def _check_step(settings: Train) -> None:
+    """Raises SettingsError for what the first step would, when a folder already is of this run."""
+    crop, chain, windows = settings.crop, settings.chain, settings.windows
+    if settings.loss.cw_ssim and crop < MIN_CROP_CW_SSIM:
+        raise SettingsError(
+            f"crop is {crop} pixels, but --cw-ssim needs {MIN_CROP_CW_SSIM} or more"
+        )
+    if settings.data:
+        return
+    check_motion(settings.motion, settings.renderings)
+    longest = int(2**31 / LONGEST_WINDOW)  # times of a sequence are int32 microseconds
+    if chain * windows > longest:
+        raise SettingsError(
+            f"chain is {chain} steps of {windows} windows, but a simulated sequence has at most "
+            f"{longest} windows: choose a shorter --chain"
+        )
 
 
 def warming_up(settings: Train) -> int:

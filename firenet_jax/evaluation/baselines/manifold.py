@@ -129,7 +129,8 @@ def advance(
     """
     elapsed = seconds_between(state.time, packets.time)
     first = -packets.age[0, 0]  # the surface begins at the time of the first event of all
-    surface = jnp.where(jnp.isnan(state.surface), first, state.surface - elapsed)
+    begins = jnp.isnan(state.surface) & (packets.count > 0)
+    surface = jnp.where(begins, first, state.surface - elapsed)
 
     def denoise_packet(k, carry):
         image, dual, surface, surface_dual = carry

@@ -85,7 +85,7 @@ function npy(bytes, name) {
     i8: BigInt64Array, u1: Uint8Array, u2: Uint16Array, u4: Uint32Array, u8: BigUint64Array,
     b1: Uint8Array,
   };
-  if (!type || !shape || head.includes("True"))
+  if (!kinds[type] || !shape || head.includes("True"))
     throw new Error(`${name}: expected an array of numbers in C order`);
   let data = new kinds[type](bytes.slice(start).buffer);
   if (type.endsWith("8") && type !== "f8") data = Float64Array.from(data, Number);
@@ -153,6 +153,7 @@ function checked({ t, x, y, p, width, height }, name) {
     throw new Error(`${name}: holds no events, or columns of different lengths`);
   let [right, bottom] = [0, 0];
   for (let n = 0; n < count; n++) {
+    if (!Number.isFinite(t[n])) throw new Error(`${name}, event ${n}: its time is ${t[n]}`);
     if (n && t[n] < t[n - 1]) throw new Error(`${name}, event ${n}: its time goes back`);
     if (!(x[n] >= 0 && y[n] >= 0 && x[n] < 32768 && y[n] < 32768))
       throw new Error(`${name}, event ${n}: outside of any sensor`);
