@@ -974,6 +974,16 @@ def test_es_and_aedat4(tmp_path):
     refused(path, "header is damaged")
 
 
+def test_an_event_stream_with_a_long_pause(tmp_path):
+    """Of its bytes that only count time, faery makes packets without events."""
+    pytest.importorskip("faery")
+    header = b"Event Stream\2\0\0\1" + np.array([64, 48], "<u2").tobytes()
+    event = b"\2" + np.array([3, 4], "<u2").tobytes()  # a tick of one microsecond
+    content = header + event + 131072 * b"\xff" + event  # each of these is 127
+    (events,) = [e for e in open_recording(write(tmp_path / "a.es", content)).events() if len(e)]
+    np.testing.assert_array_equal(np.diff(events.t), [127 * 131072 + 1])
+
+
 # ---------------------------------------------------------------- ROS bags
 
 HEADER = {1: "Header", 2: "std_msgs/Header"}

@@ -167,6 +167,8 @@ def _of_faery(
             return
         if packet is None:
             return
+        if not len(packet):  # of an Event Stream whose bytes held no event
+            continue
         yield packet["t"], packet["x"], packet["y"], packet["on"]
         seen, last = seen + len(packet), int(packet["t"][-1])
 
