@@ -3,7 +3,7 @@
 They equal the same layers applied one by one (`convolution.layer`), gradients included. Fused,
 because on a CPU separate element-wise operations between two convolutions, each of which reads and
 writes whole maps, take as long as the convolutions themselves. Maps are (B, H, W, 16) float32,
-parameters (kernel, bias), 3x3.
+parameters (kernel, bias), 3x3. Functions named own_ are by machine code, those named xla_ by XLA.
 """
 
 from functools import partial
@@ -56,44 +56,34 @@ def _gru(machine_code, h, x, gates, candidate):
 
 
 def _gru_forward(machine_code, h, x, gates, candidate):
-    def gates_by_machine_code(h, x, kernel, bias):
-        return tuple(native.convolve([x, h], kernel, bias, ("none",) * 2, "gates", [h]))
+    def own_gates(h, x, kernel, bias):
+        return native.convolve([x, h], kernel, bias, ("none",) * 2, "gates", [h])
 
-    def gates_by_xla(h, x, kernel, bias):
+    def xla_gates(h, x, kernel, bias):
         reset, update = by_xla(("sigmoid", "sigmoid"), (x, h), kernel, bias)
         return reset, update, reset * h
 
-    def candidate_by_machine_code(h, update, x, left, kernel, bias):
-        return tuple(
-            native.convolve([x, left], kernel, bias, ending="candidate", operands=[h, update])
-        )
+    def own_candidate(h, update, x, left, kernel, bias):
+        return native.convolve([x, left], kernel, bias, ending="candidate", operands=[h, update])
 
-    def candidate_by_xla(h, update, x, left, kernel, bias):
+    def xla_candidate(h, update, x, left, kernel, bias):
         (q,) = by_xla(("tanh",), (x, left), kernel, bias)
         return q, h + update * (q - h)
 
-    reset, update, left = _kept(
-        choose(machine_code, gates_by_machine_code, gates_by_xla, h, x, *gates)
-    )
-    q, state = _kept(
-        choose(
-            machine_code,
-            candidate_by_machine_code,
-            candidate_by_xla,
-            *(h, update, x, left, *candidate),
-        )
-    )
+    reset, update, left = _kept(choose(machine_code, own_gates, xla_gates, h, x, *gates))
+    arguments = h, update, x, left, *candidate
+    q, state = _kept(choose(machine_code, own_candidate, xla_candidate, *arguments))
     return state, (h, x, gates[0], candidate[0], reset, update, q)
 
 
 def _gru_backward(machine_code, kept, by_state):
     h, x, gates, candidate, reset, update, q = kept
 
-    def through_candidate_by_machine_code(change, kernel, *operands):
+    def own_candidate(change, kernel, *operands):
         both = ("none", "none")
-        return tuple(native.convolve([change], kernel, None, both, "candidate gradient", operands))
+        return native.convolve([change], kernel, None, both, "candidate gradient", operands)
 
-    def through_candidate_by_xla(change, kernel, h, reset, update, q, by_state):
+    def xla_candidate(change, kernel, h, reset, update, q, by_state):
         by_x, by_left = convolved_by_xla([change], kernel, 2)
         return (
             by_x,
@@ -102,30 +92,22 @@ def _gru_backward(machine_code, kept, by_state):
             by_left * reset + by_state * (1 - update),
         )
 
-    def through_gates_by_machine_code(changes, kernel, *operands):
-        return tuple(native.convolve(changes, kernel, None, ("none",) * 2, "add both", operands))
+    def own_gates(changes, kernel, *operands):
+        return native.convolve(changes, kernel, None, ("none",) * 2, "add both", operands)
 
-    def through_gates_by_xla(changes, kernel, by_x, by_h):
+    def xla_gates(changes, kernel, by_x, by_h):
         more_x, more_h = convolved_by_xla(changes, kernel, 2)
         return by_x + more_x, by_h + more_h
 
     change = by_state * update * (1 - q * q)
     left = reset * h  # recomputing is faster than storing it
     by_candidate = parameter_gradients(machine_code, (x, left), candidate, (change,))
-    by_x, by_reset, by_update, by_h = choose(
-        machine_code,
-        through_candidate_by_machine_code,
-        through_candidate_by_xla,
-        *(change, turned(candidate), h, reset, update, q, by_state),
-    )
+    arguments = change, turned(candidate), h, reset, update, q, by_state
+    by_x, by_reset, by_update, by_h = choose(machine_code, own_candidate, xla_candidate, *arguments)
     changes = by_reset, by_update
     by_gates = parameter_gradients(machine_code, (x, h), gates, changes)
-    by_x, by_h = choose(
-        machine_code,
-        through_gates_by_machine_code,
-        through_gates_by_xla,
-        *(changes, turned(gates), by_x, by_h),
-    )
+    arguments = changes, turned(gates), by_x, by_h
+    by_x, by_h = choose(machine_code, own_gates, xla_gates, *arguments)
     return by_h, by_x, by_gates, by_candidate
 
 
@@ -141,55 +123,44 @@ def _residual(machine_code, x, first, second):
 
 
 def _residual_forward(machine_code, x, first, second):
-    def first_by_machine_code(x, kernel, bias):
-        return tuple(native.convolve([x], kernel, bias, ("relu",)))
+    def own_first(x, kernel, bias):
+        return native.convolve([x], kernel, bias, ("relu",))
 
-    def second_by_machine_code(x, between, kernel, bias):
-        return tuple(native.convolve([between], kernel, bias, ending="residual", operands=[x]))
-
-    def second_by_xla(x, between, kernel, bias):
-        return (jax.nn.relu(x + by_xla(("none",), (between,), kernel, bias)[0]),)
-
-    def first_by_xla(x, kernel, bias):
+    def xla_first(x, kernel, bias):
         return by_xla(("relu",), (x,), kernel, bias)
 
-    (between,) = _kept(choose(machine_code, first_by_machine_code, first_by_xla, x, *first))
-    (result,) = _kept(
-        choose(machine_code, second_by_machine_code, second_by_xla, x, between, *second)
-    )
+    def own_second(x, between, kernel, bias):
+        return native.convolve([between], kernel, bias, ending="residual", operands=[x])
+
+    def xla_second(x, between, kernel, bias):
+        return (jax.nn.relu(x + by_xla(("none",), (between,), kernel, bias)[0]),)
+
+    (between,) = _kept(choose(machine_code, own_first, xla_first, x, *first))
+    (result,) = _kept(choose(machine_code, own_second, xla_second, x, between, *second))
     return result, (x, first[0], second[0], between, result)
 
 
 def _residual_backward(machine_code, kept, by_result):
     x, first, second, between, result = kept
 
-    def through_second_by_machine_code(change, kernel, between):
-        return tuple(native.convolve([change], kernel, ending="positive", operands=[between]))
+    def own_second(change, kernel, between):
+        return native.convolve([change], kernel, ending="positive", operands=[between])
 
-    def through_second_by_xla(change, kernel, between):
+    def xla_second(change, kernel, between):
         return (jnp.where(between > 0, convolved_by_xla([change], kernel, 1)[0], 0),)
 
-    def through_first_by_machine_code(change, kernel, by_result):
-        return tuple(native.convolve([change], kernel, ending="add", operands=[by_result]))
+    def own_first(change, kernel, by_result):
+        return native.convolve([change], kernel, ending="add", operands=[by_result])
 
-    def through_first_by_xla(change, kernel, by_result):
+    def xla_first(change, kernel, by_result):
         return (convolved_by_xla([change], kernel, 1)[0] + by_result,)
 
     by_result = jnp.where(result > 0, by_result, 0)
     by_second = parameter_gradients(machine_code, (between,), second, (by_result,))
-    (change,) = choose(
-        machine_code,
-        through_second_by_machine_code,
-        through_second_by_xla,
-        *(by_result, turned(second), between),
-    )
+    arguments = by_result, turned(second), between
+    (change,) = choose(machine_code, own_second, xla_second, *arguments)
     by_first = parameter_gradients(machine_code, (x,), first, (change,))
-    (by_x,) = choose(
-        machine_code,
-        through_first_by_machine_code,
-        through_first_by_xla,
-        *(change, turned(first), by_result),
-    )
+    (by_x,) = choose(machine_code, own_first, xla_first, change, turned(first), by_result)
     return by_x, by_first, by_second
 
 

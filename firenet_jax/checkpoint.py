@@ -12,7 +12,7 @@ import os
 import zipfile
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
@@ -167,36 +167,25 @@ def _flatten(tree) -> dict[str, np.ndarray]:
 # ---- PyTorch
 
 
-class _Names(NamedTuple):
-    """How one family of PyTorch checkpoints names the blocks of the network."""
-
-    normalise: bool
-    blocks: dict[str, str]
-
-
+# How each family of PyTorch checkpoints names the blocks of the network. FireNet's alone expects
+# normalised tensors.
 FAMILIES = {
-    "FireNet": _Names(
-        True,
-        {
-            "head": "head.conv.conv2d",
-            "gru1": "head.recurrent_block",
-            "res1": "resblocks.0.conv",
-            "gru2": "resblocks.0.recurrent_block",  # its GRU comes after its convolutions
-            "res2": "resblocks.1",
-            "prediction": "pred.conv2d",
-        },
-    ),
-    "FireNet+": _Names(
-        False,
-        {
-            "head": "head.conv2d",
-            "gru1": "G1",
-            "res1": "R1",
-            "gru2": "G2",
-            "res2": "R2",
-            "prediction": "pred.conv2d",
-        },
-    ),
+    "FireNet": {
+        "head": "head.conv.conv2d",
+        "gru1": "head.recurrent_block",
+        "res1": "resblocks.0.conv",
+        "gru2": "resblocks.0.recurrent_block",  # its GRU comes after its convolutions
+        "res2": "resblocks.1",
+        "prediction": "pred.conv2d",
+    },
+    "FireNet+": {
+        "head": "head.conv2d",
+        "gru1": "G1",
+        "res1": "R1",
+        "gru2": "G2",
+        "res2": "R2",
+        "prediction": "pred.conv2d",
+    },
 }
 PARTS = {
     "gates": [".reset_gate", ".update_gate"],
@@ -211,15 +200,14 @@ def convert(path: str | Path) -> Weights:
     """PyTorch checkpoint of FireNet or FireNet+ -> Weights: OIHW -> HWIO, two gates -> one."""
     path = Path(path)
     tensors = read_state_dict(path)
-    firsts = {family: f"{names.blocks['head']}.weight" for family, names in FAMILIES.items()}
+    firsts = {family: f"{blocks['head']}.weight" for family, blocks in FAMILIES.items()}
     family, prefix = identify(tensors, firsts, path, "FireNet", TRY)
-    names = FAMILIES[family]
     ours = partial(take, tensors, prefix, path, "FireNet", TRY)
 
     flat = {}
     for layer, (size, inputs, outputs) in LAYERS.items():
         block, _, part = layer.partition("/")
-        sources = [names.blocks[block] + ending for ending in PARTS[part]]
+        sources = [FAMILIES[family][block] + ending for ending in PARTS[part]]
         each = outputs // len(sources)
         kernels = [ours(f"{source}.weight", (each, inputs, size, size)) for source in sources]
         biases = [ours(f"{source}.bias", (each,)) for source in sources]
@@ -227,7 +215,7 @@ def convert(path: str | Path) -> Weights:
         flat[f"{layer}/bias"] = np.concatenate(biases)
 
     refuse_unused(tensors, prefix, path, "FireNet", TRY)
-    return Weights(params=unflatten_dict(flat, sep="/"), normalise=names.normalise)
+    return Weights(params=unflatten_dict(flat, sep="/"), normalise=family == "FireNet")
 
 
 def original_names(weights: Weights) -> tuple[str, dict[str, np.ndarray]]:
@@ -237,12 +225,11 @@ def original_names(weights: Weights) -> tuple[str, dict[str, np.ndarray]]:
     """
     flat = _flatten(weights.params)
     _check(Path("these weights"), flat, "cannot be written")
-    family = next(name for name, names in FAMILIES.items() if names.normalise == weights.normalise)
-    prefix = "net." if family == "FireNet" else ""
+    family, prefix = ("FireNet", "net.") if weights.normalise else ("FireNet+", "")
     tensors = {}
     for layer in LAYERS:
         block, _, part = layer.partition("/")
-        sources = [FAMILIES[family].blocks[block] + ending for ending in PARTS[part]]
+        sources = [FAMILIES[family][block] + ending for ending in PARTS[part]]
         kernels = np.split(flat[f"{layer}/kernel"].transpose(3, 2, 0, 1), len(sources))
         biases = np.split(flat[f"{layer}/bias"], len(sources))
         for source, kernel, bias in zip(sources, kernels, biases, strict=True):

@@ -15,37 +15,17 @@ import sys
 
 from firenet_jax.errors import FirenetError
 
-# name: (module, settings, what it does)
+# name: what it does; `commands.demo.Demo` are the settings of demo
 COMMANDS = {
-    "demo": (
-        "firenet_jax.commands.demo",
-        "Demo",
-        "a simulated scene -> events | reconstruction | truth",
-    ),
-    "reconstruct": (
-        "firenet_jax.commands.reconstruct",
-        "Reconstruct",
-        "recordings -> video or pictures",
-    ),
-    "live": ("firenet_jax.commands.live", "Live", "a camera or a stream -> live pictures"),
-    "info": ("firenet_jax.commands.info", "Info", "what a recording holds"),
-    "simulate": (
-        "firenet_jax.commands.simulate",
-        "Simulate",
-        "random scenes or a video file -> events",
-    ),
-    "train": ("firenet_jax.commands.train", "Train", "sequences or recordings -> weights"),
-    "evaluate": (
-        "firenet_jax.commands.evaluate",
-        "Evaluate",
-        "recordings with frames -> a comparison of methods",
-    ),
-    "convert": ("firenet_jax.commands.convert", "Convert", "PyTorch checkpoint -> weights.npz"),
-    "export": (
-        "firenet_jax.commands.export",
-        "Export",
-        "weights -> ONNX, StableHLO, PyTorch, safetensors, a web page",
-    ),
+    "demo": "a simulated scene -> events | reconstruction | truth",
+    "reconstruct": "recordings -> video or pictures",
+    "live": "a camera or a stream -> live pictures",
+    "info": "what a recording holds",
+    "simulate": "random scenes or a video file -> events",
+    "train": "sequences or recordings -> weights",
+    "evaluate": "recordings with frames -> a comparison of methods",
+    "convert": "PyTorch checkpoint -> weights.npz",
+    "export": "weights -> ONNX, StableHLO, PyTorch, safetensors, a web page",
 }
 
 # Libraries that only some commands need -> the extra of this package that installs them.
@@ -77,7 +57,7 @@ FORMER = {
 
 
 def usage() -> str:
-    lines = [f"  firenet {name:13} {summary}" for name, (_, _, summary) in COMMANDS.items()]
+    lines = [f"  firenet {name:13} {summary}" for name, summary in COMMANDS.items()]
     return "\n".join(
         [
             "firenet_jax: event camera recordings become video (FireNet in JAX)",
@@ -189,7 +169,6 @@ def main(arguments: list[str] | None = None) -> int:
     name, rest = arguments[0], arguments[1:]
     _set_malloc(KEEP_FREED_MEMORY if name == "train" else RETURN_FREED_MEMORY)
     os.environ["JAX_ENABLE_X64"] = "0"  # for other programs of this user: here all is float32
-    module, settings, _ = COMMANDS[name]
     for option in (word.partition("=")[0] for word in rest):
         if name == "reconstruct" and option in FORMER:
             print(
@@ -200,8 +179,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         from firenet_jax.commands import options
 
-        command = importlib.import_module(module)
-        kind = getattr(command, settings)
+        command = importlib.import_module(f"firenet_jax.commands.{name}")
+        kind = getattr(command, name.capitalize())
         command.run(options.parse(kind, rest, f"firenet {name}", inspect.getdoc(kind) or ""))
     except KeyboardInterrupt as error:
         goes_on = str(error) or "a folder of pictures or sequences goes on when run again"

@@ -56,11 +56,6 @@ def side_by_side(image: jax.Array, kernel: jax.Array, pixels: int) -> jax.Array:
     return image.reshape(batch, height, pixels * groups, outputs)[:, :, :width]
 
 
-def convolve(image: jax.Array, kernel: jax.Array) -> jax.Array:
-    """(B, H, W, I), (rows, columns, I, O) -> (B, H, W, O); gradients in reverse mode only."""
-    return layer([image], kernel)[0]
-
-
 def layer(
     maps: Sequence[jax.Array],
     kernel: jax.Array,
@@ -93,7 +88,7 @@ CONVOLVED = "convolved"
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def _layer(machine_code: bool, activations, maps, kernel, bias) -> tuple[jax.Array, ...]:
     def by_machine_code(maps, kernel, bias):
-        return tuple(native.convolve(maps, kernel, bias, activations))
+        return native.convolve(maps, kernel, bias, activations)
 
     return choose(machine_code, by_machine_code, partial(by_xla, activations), maps, kernel, bias)
 
@@ -139,14 +134,10 @@ def _backward(machine_code, activations, kept, gradients):
     )
 
     def images_by_machine_code(gradients, flipped):
-        return tuple(native.convolve(gradients, flipped, None, ("none",) * len(maps)))
+        return native.convolve(gradients, flipped, None, ("none",) * len(maps))
 
-    by_maps = choose(
-        machine_code,
-        images_by_machine_code,
-        partial(convolved_by_xla, results=len(maps)),
-        *(gradients, turned(kernel)),
-    )
+    xla = partial(convolved_by_xla, results=len(maps))
+    by_maps = choose(machine_code, images_by_machine_code, xla, gradients, turned(kernel))
     return by_maps, *parameter_gradients(machine_code, maps, kernel, gradients)
 
 
@@ -160,10 +151,8 @@ def parameter_gradients(machine_code: bool, maps, kernel, gradients) -> tuple[ja
         by_bias = jnp.sum(joined, (0, 1, 2), dtype=jnp.float32).astype(kernel.dtype)
         return by(_joined(maps), kernel, joined), by_bias
 
-    def by_machine_code(*these):
-        return native.gradients(*these)
-
-    return choose(machine_code, by_machine_code, by_xla, maps, kernel, gradients)
+    arguments = maps, kernel, gradients
+    return choose(machine_code, lambda *these: native.gradients(*these), by_xla, *arguments)
 
 
 _layer.defvjp(_forward, _backward)

@@ -21,17 +21,9 @@ from jax.sharding import Mesh
 from firenet_jax import colour, native
 from firenet_jax.devices import BATCH, REPLICATED, TIME_BATCH, on_each_device
 from firenet_jax.errors import logger
-from firenet_jax.events import Events, Recording, check_recording
+from firenet_jax.events import Recording, check_recording
 from firenet_jax.instants import WARM_UP, Counts, Grid, Step, check, steps, warming
-from firenet_jax.network import (
-    BINS,
-    CHANNELS,
-    State,
-    Weights,
-    initial_params,
-    initial_state,
-    step,
-)
+from firenet_jax.network import BINS, CHANNELS, State, Weights, initial_params, initial_state, step
 from firenet_jax.pictures import (
     Display,
     DisplayState,
@@ -39,15 +31,7 @@ from firenet_jax.pictures import (
     event_pictures,
     initial_display_state,
 )
-from firenet_jax.tensors import (
-    PACKED_SPECS,
-    Packed,
-    capacity,
-    in_groups,
-    normalise,
-    pack,
-    voxelise,
-)
+from firenet_jax.tensors import PACKED_SPECS, Packed, in_groups, normalise, voxelise
 from firenet_jax.windows import Windows, cut, usual
 
 
@@ -97,21 +81,23 @@ def reconstruct(
     if dtype == jnp.float32 and machine_code:
         return _quickest(recurrent, weights, state, tensors, valid)
     with native.by_xla_alone(not machine_code):
-        return _by_xla(recurrent, dtype, weights, state, tensors, valid)
+        return _by_xla(_scan, recurrent, dtype, weights, state, tensors, valid)
 
 
-def _by_xla(recurrent: bool, dtype, weights: Weights, state: State, tensors, valid):
-    network_step = partial(step, weights.params, dtype=dtype)
-    return _scan(network_step, recurrent, weights, state, tensors, valid)
+def _by_xla(scan, recurrent: bool, dtype, weights: Weights, *inputs):
+    """scan: `_scan` or `_scan_at`; inputs: what they take after the weights."""
+    return scan(partial(step, weights.params, dtype=dtype), recurrent, weights, *inputs)
 
 
-def _by_machine_code(recurrent: bool, weights: Weights, state: State, tensors, valid):
+def _by_machine_code(scan, recurrent: bool, weights: Weights, state, tensors, *inputs):
     packed, normalised = native.pack(weights.params), replace(weights, normalise=False)
     native_step = partial(native.step, packed, normalise=weights.normalise)
-    if len(tensors) == 1:  # not in place, which would overwrite the caller's state
+    if len(tensors) == 1 or scan is _scan_at:
+        # Not in place: that would overwrite the caller's state, or the one a look starts from.
         native_step = partial(native_step, in_place=False)
-    kept, images = _scan(native_step, recurrent, normalised, tuple(state), tensors, valid)
-    return State(*kept), images
+    kept = jax.tree.map(tuple, state, is_leaf=lambda part: isinstance(part, State))
+    kept, images = scan(native_step, recurrent, normalised, kept, tensors, *inputs)
+    return jax.tree.unflatten(jax.tree.structure(state), jax.tree.leaves(kept)), images
 
 
 def _scan(step, recurrent: bool, weights: Weights, state, tensors, valid):
@@ -127,13 +113,13 @@ def _scan(step, recurrent: bool, weights: Weights, state, tensors, valid):
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _quickest(recurrent, *inputs):
-    xla = partial(_by_xla, recurrent, jnp.float32)
-    return native.choose(partial(_by_machine_code, recurrent), xla, *inputs)
+    xla = partial(_by_xla, _scan, recurrent, jnp.float32)
+    return native.choose(partial(_by_machine_code, _scan, recurrent), xla, *inputs)
 
 
 def _forward(recurrent, *inputs):
     """By XLA: machine code does not keep the values that a gradient needs."""
-    return jax.vjp(partial(_by_xla, recurrent, jnp.float32), *inputs)
+    return jax.vjp(partial(_by_xla, _scan, recurrent, jnp.float32), *inputs)
 
 
 def _backward(recurrent, gradient_of, cotangents):
@@ -240,7 +226,7 @@ class Looks(NamedTuple):
     share: np.ndarray  # (T, B) float32: a look starts from (1 - share) before + share last
 
 
-@partial(jax.jit, static_argnames=("recurrent", "dtype", "machine_code"))
+@partial(jax.jit, static_argnames=("recurrent", "dtype"))
 def reconstruct_at(
     weights: Weights,
     committed: Committed,
@@ -250,7 +236,6 @@ def reconstruct_at(
     *,
     recurrent: bool = True,
     dtype=jnp.float32,
-    machine_code: bool = True,
 ) -> tuple[Committed, jax.Array]:
     """(Committed, (T, B, H, W, 5), Looks) -> (Committed, images (T, B, H, W) float32).
 
@@ -261,24 +246,10 @@ def reconstruct_at(
     if valid is None:
         valid = jnp.ones(tensors.shape[:2], bool)
     inputs = weights, Committed(before, last), tensors, steps, valid
-    xla = partial(_at_by_xla, recurrent, dtype)
-    if dtype == jnp.float32 and machine_code:
-        return native.choose(partial(_at_by_machine_code, recurrent), xla, *inputs)
-    with native.by_xla_alone(not machine_code):
-        return xla(*inputs)
-
-
-def _at_by_xla(recurrent: bool, dtype, weights: Weights, *inputs):
-    return _scan_at(partial(step, weights.params, dtype=dtype), recurrent, weights, *inputs)
-
-
-def _at_by_machine_code(recurrent: bool, weights: Weights, committed: Committed, tensors, *inputs):
-    packed, normalised = native.pack(weights.params), replace(weights, normalise=False)
-    # Not in place: the state that a look starts from is still needed.
-    native_step = partial(native.step, packed, normalise=weights.normalise, in_place=False)
-    kept = Committed._make(map(tuple, committed))
-    kept, images = _scan_at(native_step, recurrent, normalised, kept, tensors, *inputs)
-    return Committed._make(State(*state) for state in kept), images
+    xla = partial(_by_xla, _scan_at, recurrent, dtype)
+    if dtype == jnp.float32:
+        return native.choose(partial(_by_machine_code, _scan_at, recurrent), xla, *inputs)
+    return xla(*inputs)
 
 
 def _scan_at(step, recurrent: bool, weights: Weights, committed: Committed, tensors, steps, valid):
@@ -333,17 +304,13 @@ def images_at(
     check_recording(recording)
     chosen = Windows(**windows) if windows else usual(recording.events())
     check(chosen)
-    height, width, size = recording.height, recording.width, 0
-    state = initial_state(1, height, width)
+    state = initial_state(1, recording.height, recording.width)
     committed = Committed(state, state)
     first, cutter = warming(cut(recording, chosen), recording.pixels, warm_up)
     counts = Counts()
     times = copy.copy(times) if isinstance(times, Grid) else times  # a grid counts on
     entries = itertools.chain(first, steps(recording, chosen, times, cutter, counts))
-    for group in in_groups(entries, chunk):
-        rows = [[step.events] for step in group] + [[Events.empty()]] * (chunk - len(group))
-        size = capacity(sum(len(row[0]) for row in rows), size)
-        tensors = voxelise(pack(rows, size), height=height, width=width)
+    for group, tensors in in_groups(recording, entries, chunk):
         looks, valid = looks_of([group], chunk), np.arange(chunk)[:, None] < len(group)
         committed, images = reconstruct_at(weights, committed, tensors, looks, valid)
         seen = np.flatnonzero(looks.looks[:, 0])

@@ -1,7 +1,7 @@
 """Command-line values -> checked, parsed values, or a SettingsError."""
 
 import math
-from typing import overload
+from typing import Any, overload
 
 from firenet_jax.errors import SettingsError
 
@@ -10,8 +10,6 @@ LONGEST_SIDE = 2**15  # pixels; coordinates are int16
 
 @overload
 def parse_size(text: str) -> tuple[int, int]: ...
-@overload
-def parse_size(text: None) -> None: ...
 @overload
 def parse_size(text: str | None) -> tuple[int, int] | None: ...
 def parse_size(text: str | None) -> tuple[int, int] | None:
@@ -30,6 +28,21 @@ def check_seed(seed: int) -> None:
     """Raises SettingsError unless jax, numpy and grain all accept this seed."""
     if not 0 <= seed < 2**32:
         raise SettingsError(f"seed is {seed}, but must be 0 or more, and less than 2^32")
+
+
+def check_share(name: str, share: float, of: str) -> None:
+    """Raises SettingsError unless this is a share of all `of`."""
+    if not 0 <= share <= 1:
+        raise SettingsError(f"{name} is {share}, but is a part of the {of}, 0-1")
+
+
+def check_sizes(settings: Any, *names: str, zero: bool = False) -> None:
+    """Raises SettingsError unless these fields are finite and more than 0 (zero: or 0), or None."""
+    for name in names:
+        value = getattr(settings, name)
+        if value is not None and not (0 < value < math.inf or zero and value == 0):
+            least = "0 or more" if zero else "more than 0"
+            raise SettingsError(f"{name} is {value}, but must be {least}")
 
 
 def check_range(name: str, bounds: tuple[float, float]) -> None:

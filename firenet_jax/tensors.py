@@ -16,7 +16,7 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,7 @@ from firenet_jax.windows import Windows, cut
 # events on memory matters more, so at most twice.
 CAPACITIES = 2**14, 2**17, *(2**k for k in range(20, 30))
 
+Item = TypeVar("Item", bound=Any)  # has `events`
 BLOCK, BLOCKS = 2**17, 8  # on a CPU: events per step of the scan, and how far it is unrolled
 
 
@@ -62,9 +63,7 @@ def capacity(events: int, at_least: int = 0) -> int:
 
 
 def pack(
-    windows: Sequence[Sequence[Events]],
-    size: int | None = None,
-    bounds: np.ndarray | None = None,
+    windows: Sequence[Sequence[Events]], size: int | None = None, bounds: np.ndarray | None = None
 ) -> Packed:
     """T rows of B windows -> one flat list for the device.
 
@@ -93,13 +92,8 @@ def pack(
         bounds = np.array([(w.t[0], w.t[-1]) if len(w) else (0, 0) for w in flat], np.int64)
     t_min, t_max = np.asarray(bounds, np.int64).reshape(-1, 2).T
 
-    t, x, y, p, window = _columns(size, (np.int32, np.int16, np.int16, bool, np.int16))
     packed = Packed(
-        t,
-        x,
-        y,
-        p,
-        window,
+        *_columns(size, (np.int32, np.int16, np.int16, bool, np.int16)),
         t_min=t_min.astype(np.int32).reshape(shape),
         duration=np.maximum(t_max - t_min, 1).astype(np.float32).reshape(shape),
     )
@@ -256,16 +250,17 @@ def event_tensors(
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but must be 1 or more windows")
     check_recording(recording)
-    size = 0
-    for group in in_groups(cut(recording, Windows(**windows)), chunk):
-        rows = [[window.events] for window in group]
-        rows += [[Events.empty()]] * (chunk - len(group))
-        size = capacity(sum(len(row[0]) for row in rows), size)
-        tensors = voxelise(pack(rows, size), height=recording.height, width=recording.width)
+    for group, tensors in in_groups(recording, cut(recording, Windows(**windows)), chunk):
         yield tensors[: len(group)], np.array([window.time for window in group], np.int64)
 
 
-def in_groups(items: Iterator, size: int) -> Iterator[list]:
-    """Items -> lists of `size` of them, the last one shorter."""
-    while group := list(itertools.islice(items, size)):
-        yield group
+def in_groups(
+    recording: Recording, items: Iterator[Item], chunk: int
+) -> Iterator[tuple[list[Item], jax.Array]]:
+    """Windows or steps of a recording -> lists of `chunk` of them, the last one shorter, with
+    tensors (chunk, 1, H, W, 5), not normalised; those of missing ones are zeros."""
+    size = 0
+    while group := list(itertools.islice(items, chunk)):
+        rows = [[item.events] for item in group] + [[Events.empty()]] * (chunk - len(group))
+        size = capacity(sum(len(row[0]) for row in rows), size)
+        yield group, voxelise(pack(rows, size), height=recording.height, width=recording.width)

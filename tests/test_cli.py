@@ -80,8 +80,9 @@ def test_help_breaks_no_line_and_speaks_no_python(capsys, monkeypatch, command):
         allowed = word == "{" and re.findall(r"{[a-z0-9_,]+}", options)
         assert word not in options or allowed, word
     # Where there is room, each text is one line.
-    module, kind, _ = cli.COMMANDS[command]
-    source = inspect.getsourcefile(getattr(importlib.import_module(module), kind))
+    kind = command.capitalize()
+    module = importlib.import_module(f"firenet_jax.commands.{command}")
+    source = inspect.getsourcefile(getattr(module, kind))
     settings = ast.parse(Path(source).read_text()).body
     body = next(node for node in settings if getattr(node, "name", "") == kind).body
     pairs = [(a, b) for a, b in itertools.pairwise(body) if isinstance(a, ast.AnnAssign)]

@@ -657,7 +657,7 @@ def test_a_second_run_into_a_folder_touches_nothing(tmp_path, weights, monkeypat
     (partial / "resume.12.npz").write_bytes(b"of the first run, not published yet")
     before = {path.name: path.read_bytes() for path in partial.iterdir()}
     if not seen:  # the second asks for the lock later, in another place
-        monkeypatch.setattr(reconstruct, "check_free", lambda path: None)
+        monkeypatch.setattr(reconstruct.video, "check_free", lambda path: None)
     for output in (out, tmp_path / "out.mp4"):
         if output.suffix:
             (tmp_path / "out.partial.mp4").write_bytes(b"half")

@@ -72,8 +72,8 @@ EVERY = [(page, command) for page in PAGES for command in commands(page)]
 
 def as_settings(command):
     name, *rest = understood(command)
-    module, settings, _ = cli.COMMANDS[name]
-    kind = getattr(importlib.import_module(module), settings)
+    module = importlib.import_module(f"firenet_jax.commands.{name}")
+    kind = getattr(module, name.capitalize())
     return tyro.cli(kind, args=rest, config=(tyro.conf.OmitArgPrefixes,))
 
 

@@ -7,7 +7,6 @@ clipped to [0, 1], with the truth at each window's end, after the state has warm
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -21,13 +20,7 @@ from firenet_jax.checkpoint import load_weights
 from firenet_jax.errors import SettingsError
 from firenet_jax.evaluation.metrics import mse, ssim, temporal_error
 from firenet_jax.network import Weights, initial_state
-from firenet_jax.pictures import (
-    Display,
-    DisplayState,
-    display,
-    event_pictures,
-    initial_display_state,
-)
+from firenet_jax.pictures import DisplayState, display, event_pictures, initial_display_state
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.settings import check_seed, parse_size
 from firenet_jax.simulation.scenes import Scene, SceneSettings, random_scene
@@ -144,21 +137,17 @@ def make_scene(settings: Demo, height: int, width: int) -> tuple[Sensor, Scene]:
     # installation has, so that a seed gives the same scene on all machines.
     pictures = photographs({"skimage/data": HELD_OUT["skimage/data"]})
     textures = load_textures(pictures, count=16, size=320, seed=settings.seed)
+    size = {"height": height, "width": width}
     scene = random_scene(
         scene_key,
         jnp.asarray(textures),
-        height=height,
-        width=width,
         duration=settings.seconds,
         speed=0.5 * RENDERINGS * settings.fps,
         settings=SceneSettings(pause=0.0),
+        **size,
     )
-    sensor = random_sensor(
-        sensor_key,
-        height=height,
-        width=width,
-        settings=FAULTY if settings.faults else SensorSettings(),
-    )
+    faults = FAULTY if settings.faults else SensorSettings()
+    sensor = random_sensor(sensor_key, settings=faults, **size)
     return jax.tree.map(lambda leaf: leaf[None], (sensor, scene))
 
 
@@ -186,12 +175,12 @@ def pictures(
             yield np.concatenate([shown.events[t], *greys], 1), shown.errors[t]
 
 
-@partial(jax.jit, static_argnames="settings")
-def _show(simulated, images, last, ranges: DisplayState, settings: Display = Display()):
+@jax.jit
+def _show(simulated, images, last, ranges: DisplayState):
     """Windows of one sequence, images (T, H, W), and what came before them: the last (image, truth)
     and the ranges that were shown."""
     tensors, truth, displacement, visible = (leaf[:, 0] for leaf in simulated)
-    ranges, greys = display(ranges, images[:, None], settings=settings)
+    ranges, greys = display(ranges, images[:, None])
     clipped = jnp.clip(images, 0.0, 1.0)
     before = (
         jnp.concatenate([one[None], all[:-1]])

@@ -131,17 +131,10 @@ class Evaluate:
         """Raises SettingsError for invalid values."""
         wanted = self.times.wanted
         frame_to_frame = self.events is None and self.duration is None and not wanted
-        return Protocol(
-            Windows(self.events, None, self.duration, frame_to_frame),
-            self.times.in_words() if wanted else None,
-            self.keep_ratio,
-            self.seed,
-            self.start,
-            self.stop,
-            self.warm_up,
-            self.tolerance,
-            self.equalise,
-        )
+        windows = Windows(self.events, None, self.duration, frame_to_frame)
+        images_at = self.times.in_words() if wanted else None
+        same = "keep_ratio", "seed", "start", "stop", "warm_up", "tolerance", "equalise"
+        return Protocol(windows, images_at, **{name: getattr(self, name) for name in same})
 
 
 def run(settings: Evaluate) -> dict:

@@ -1,7 +1,6 @@
 """Live events -> live pictures on a local web page."""
 
 import json
-import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -21,7 +20,7 @@ from firenet_jax.live.engine import Figures, Limits, cooled, pictures
 from firenet_jax.live.page import Board, serve
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
-from firenet_jax.settings import parse_size
+from firenet_jax.settings import check_sizes, parse_size
 from firenet_jax.storage.screen import Screen
 from firenet_jax.windows import DEFAULT_LONGEST, Windows
 
@@ -77,9 +76,7 @@ class Live:
     display: Display = Display()
 
     def __post_init__(self):
-        for name in ("speed", "repeat", "behind"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise SettingsError(f"{name} is {getattr(self, name)}, but must be more than 0")
+        check_sizes(self, "speed", "repeat", "behind")
         if not 0 <= self.port < 2**16:
             raise SettingsError(f"port is {self.port}, but ports are 0 to 65535")
         Windows(events_per_pixel=self.events_per_pixel, longest=self.longest)  # checks them

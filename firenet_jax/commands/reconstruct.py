@@ -27,7 +27,8 @@ from firenet_jax.network import Weights
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import Network
-from firenet_jax.settings import parse_size
+from firenet_jax.settings import check_sizes, parse_size
+from firenet_jax.storage import video
 from firenet_jax.storage.arrays import ArraysWriter
 from firenet_jax.storage.bag import BagWriter, check_topic
 from firenet_jax.storage.files import OutputError, check_apart, identity, named
@@ -35,17 +36,6 @@ from firenet_jax.storage.progress import Bytes, bar
 from firenet_jax.storage.resume import done_file, is_done, read_position
 from firenet_jax.storage.runs import recorded
 from firenet_jax.storage.screen import check_screen
-from firenet_jax.storage.video import (
-    OTHER_FILES,
-    VIDEOS,
-    WHOLE,
-    check_free,
-    check_output,
-    check_rate,
-    followed,
-    like_a_file,
-    open_writer,
-)
 from firenet_jax.windows import DEFAULT_LONGEST, Windows, in_words, usual
 
 # Settings that are not part of a run's record: the pictures do not depend on them (on the chunk
@@ -131,15 +121,12 @@ class Reconstruct:
 
     def __post_init__(self):
         if self.fps is not None:
-            check_rate(self.output, self.fps)
+            video.check_rate(self.output, self.fps)
             if self.speed is not None:
                 raise SettingsError("fps and speed: a video has one or the other, leave one out")
         if self.speed is not None and not 1e-6 <= self.speed <= 1e6:
             raise SettingsError(f"speed is {self.speed}, but must be more than 0; 1 is real time")
-        for name in ("chunk", "batch"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise SettingsError(f"{name} is {value}, but must be more than 0")
+        check_sizes(self, "chunk", "batch")
         if (self.chunk or 1) * (self.batch or 1) >= 2**15:  # `pack` would say it, after a minute
             raise SettingsError(
                 f"chunk is {self.chunk or 1} and batch {self.batch or 1}, but fewer than 32768 "
@@ -183,10 +170,10 @@ def run(settings: Reconstruct) -> list[Path]:
     if not outputs:
         return []
     for output in outputs:  # before opening recordings: some are read whole to infer their size
-        check_free(output)
+        video.check_free(output)
         check_apart(output, settings.recordings)
         if not done_file(output).is_file():
-            check_output(output, settings.overwrite)
+            video.check_output(output, settings.overwrite)
     outcome = Outcome()
     paths = zip(settings.recordings[mine], outputs, strict=True)
     jobs = [
@@ -244,31 +231,31 @@ def by_sensor_size(jobs: list[Job]) -> list[list[Job]]:
 def plan(recordings: tuple[Path, ...], output: Path) -> list[Path]:
     """The output of each recording: `output` itself if there is only one recording."""
     if len(recordings) == 1:
-        return [followed(output)]
+        return [video.followed(output)]
     stems = [_stem(named(path)) for path in recordings]
-    if output.suffix not in WHOLE:
+    if output.suffix not in video.WHOLE:
         stems = [_of_a_folder(stem) for stem in stems]
     twice = next((stem for stem in stems if stems.count(stem) > 1), None)
     if twice:
         raise OutputError(
             f"two recordings are named {twice} and would write the same output: run them apart"
         )
-    if output.suffix in WHOLE:
-        return [followed(output.with_suffix("") / f"{stem}{output.suffix}") for stem in stems]
-    return [followed(output / stem) for stem in stems]
+    if output.suffix in video.WHOLE:
+        return [video.followed(output.with_suffix("") / f"{stem}{output.suffix}") for stem in stems]
+    return [video.followed(output / stem) for stem in stems]
 
 
 def _of_a_folder(stem: str) -> str:
     """A name that no file has: `cam.left` -> `cam_left`."""
     suffix = Path(stem).suffix
-    return f"{Path(stem).stem}_{suffix[1:]}" if like_a_file(suffix) else stem
+    return f"{Path(stem).stem}_{suffix[1:]}" if video.like_a_file(suffix) else stem
 
 
 def _stem(path: Path) -> str:
     """The name without its suffixes: `a.txt.gz` -> `a`, but `a.1.txt` -> `a.1`. The name of a
     folder is kept."""
     path = path if path.is_dir() else path.with_suffix("")
-    while path.suffix.lower() in (*VIDEOS, *OTHER_FILES):
+    while path.suffix.lower() in (*video.VIDEOS, *video.OTHER_FILES):
         path = path.with_suffix("")
     return path.name
 
@@ -304,7 +291,7 @@ def job_of(
     if is_done(output, record):
         logger.warning("%s: done by the run that this one continues", output)
         return None
-    check_output(output, settings.overwrite)
+    video.check_output(output, settings.overwrite)
     read_position(output, record, settings.overwrite)  # so that errors come before the work
     return Job(
         recording=recording,
@@ -363,7 +350,7 @@ def writer_of(output: Path, settings: Reconstruct, speed: float) -> Writer:
     if output.suffix in (".bag", ".ros2"):
         return BagWriter(output, settings.topic, settings.frame_id)
     by_time = settings.names == "nanoseconds"
-    return open_writer(output, settings.fps, speed, settings.times.wanted, by_time)
+    return video.open_writer(output, settings.fps, speed, settings.times.wanted, by_time)
 
 
 def describe(
@@ -386,7 +373,7 @@ def describe(
     if settings.hot_pixels not in (None, "auto"):  # what the file holds counts, not its name
         hot = hot_pixels(settings.hot_pixels, recording)
         told["hot_pixels"] = hashlib.sha256(hot.tobytes()).hexdigest()
-    if settings.output.suffix in VIDEOS:
+    if settings.output.suffix in video.VIDEOS:
         told |= {"fps": settings.fps, "speed": settings.speed}
     in_a_bag = settings.output.suffix in (".bag", ".ros2")
     of_bags = () if in_a_bag else ("topic", "frame_id")

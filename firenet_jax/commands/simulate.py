@@ -41,18 +41,10 @@ from firenet_jax.simulation.sensor import (
     with_faults,
 )
 from firenet_jax.simulation.textures import load_textures
+from firenet_jax.storage import runs
 from firenet_jax.storage.files import partial_name, write_text
 from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import bar
-from firenet_jax.storage.runs import (
-    alone_in,
-    as_text,
-    check_same,
-    differences,
-    make_folder,
-    read_record,
-    recorded,
-)
 from firenet_jax.storage.sequence_file import Picture, write_sequence
 
 FLOW_BITS = 11  # of the fastest pixel's flow, see `rounded_flow`
@@ -157,15 +149,15 @@ def run(settings: Simulate) -> list[Path]:
     if folder.is_file() or folder.suffix in CLIP_SUFFIXES:
         raise OutputError(f"{folder}: sequences go into a folder: choose another name")
     if processes == 1:
-        with alone_in(folder):
+        with runs.alone_in(folder):
             open_folder(settings)
             return write_sequences(settings, height, width)
     if process:
         _wait_for(folder / "settings.json")
-    make_folder(folder)
+    runs.make_folder(folder)
     open_folder(settings)
     mine = folder / "running" / f"{process} of {processes}"
-    with alone_in(mine):
+    with runs.alone_in(mine):
         written = write_sequences(settings, height, width, process, processes)
     with contextlib.suppress(OSError):  # others are still there
         mine.rmdir()
@@ -306,7 +298,7 @@ def rounded_flow(velocity: np.ndarray) -> np.ndarray:
 
 def describe(settings: Simulate) -> dict:
     """All that a sequence depends on, apart from its number; ready for JSON."""
-    return recorded(
+    return runs.recorded(
         settings,
         but=UNRECORDED,
         images=None if settings.images is None else settings.images.resolve(),
@@ -319,7 +311,7 @@ def open_folder(settings: Simulate) -> None:
     """Finds that the folder is new or one to go on with; else raises OutputError."""
     folder, record = settings.output, describe(settings)
     kept = folder / "settings.json"
-    found = read_record(kept, "choose another output")
+    found = runs.read_record(kept, "choose another output")
     if found is None and any(folder.iterdir()):
         raise OutputError(
             f"{folder} is not empty, and holds no settings.json of an earlier run: choose another "
@@ -331,14 +323,14 @@ def open_folder(settings: Simulate) -> None:
             f"{kept} is of something else (it says {min(others)}): choose another output"
         )
     if found is not None and not empty:
-        check_same(
+        runs.check_same(
             found, record, f"{folder} holds sequences of other settings",
             "choose another output, or go on with the same settings",
         )  # fmt: skip
     for name in ("train", "validation"):
-        make_folder(folder / name)
-    if found is None or differences(found, record):
-        write_text(kept, as_text(record) + "\n")
+        runs.make_folder(folder / name)
+    if found is None or runs.differences(found, record):
+        write_text(kept, runs.as_text(record) + "\n")
 
 
 def in_words(size: float) -> str:
@@ -366,7 +358,7 @@ def simulate_clip(settings: Simulate, clip: Path) -> Path:
         raise OutputError(f"{path}: with --video the output is one file: name it {path}.h5")
     if path.is_dir() or (path.exists() and not settings.overwrite):
         raise OutputError(f"{path} exists: choose another output or pass --overwrite")
-    make_folder(path.parent)
+    runs.make_folder(path.parent)
     size = parse_size(settings.sensor_size)
     pictures = list(itertools.islice(read_clip(clip, size), 2))
     if len(pictures) < 2:
@@ -375,9 +367,8 @@ def simulate_clip(settings: Simulate, clip: Path) -> Path:
         )
     height, width = pictures[0].image.shape
     sensor = with_faults(settings.sensor) if settings.faults else settings.sensor
-    camera = random_sensor(
-        jax.random.key(settings.seed), height=height, width=width, settings=sensor
-    )
+    sides = {"height": height, "width": width}
+    camera = random_sensor(jax.random.key(settings.seed), settings=sensor, **sides)
 
     def renderings():
         # The sensor takes log intensity as linear between two renderings: these are the pictures.
@@ -388,13 +379,7 @@ def simulate_clip(settings: Simulate, clip: Path) -> Path:
 
     record = {k: v for k, v in describe(settings).items() if k not in OF_SCENES}
     record |= {"video": clip.name, "sensor_size": f"{width}x{height}"}
-    count = write_sequence(
-        path,
-        ahead(event_list(camera, renderings()), depth=4),
-        read_clip(clip, size),
-        height=height,
-        width=width,
-        settings=record,
-    )
+    events = ahead(event_list(camera, renderings()), depth=4)
+    count = write_sequence(path, events, read_clip(clip, size), settings=record, **sides)
     print(f"{path}: {count:,} events of {width}x{height} pixels")
     return path

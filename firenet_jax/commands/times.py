@@ -18,19 +18,15 @@ import numpy as np
 from firenet_jax.errors import RecordingError, SettingsError, logger
 from firenet_jax.events import MAX_TIME, Events, Recording, counted
 from firenet_jax.instants import Grid, check_rate, grid
+from firenet_jax.readers import text
 from firenet_jax.storage.files import check_no_pipe
 
 UNITS = {"s": 10**6, "ms": 10**3, "us": 1, "ns": Decimal("0.001")}  # microseconds
-UNIT_OF = {
-    "s": "s", "sec": "s", "secs": "s", "second": "s", "seconds": "s",
-    "ms": "ms", "msec": "ms", "millisecond": "ms", "milliseconds": "ms",
-    "us": "us", "µs": "us", "μs": "us", "usec": "us", "microsecond": "us", "microseconds": "us",
-    "ns": "ns", "nsec": "ns", "nanosecond": "ns", "nanoseconds": "ns",
-}  # fmt: skip
+UNIT_OF = {name: names[0] for names in text.UNITS.values() for name in names}
+UNIT_NAMES = {names[0]: names[-1] for names in text.UNITS.values()}  # "ms": "milliseconds"
 COLUMN = re.compile(r"t|time|timestamps?|stamps?")  # without its unit
 NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-zµμ]*)", re.IGNORECASE)
 SPLIT = re.compile(r"[\s,;]+")
-UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 LARGEST = 1 << 28  # bytes of a file of times
 
 
@@ -120,9 +116,7 @@ def times_of(
 
 
 def _triggers(wanted: Times, recording: Recording) -> np.ndarray:
-    read = getattr(recording, "triggers", None)
-    found = None if read is None else read()
-    if found is None:
+    if (found := recording.triggers()) is None:
         raise RecordingError(
             f"{recording.path}: holds no triggers that its reader knows: use --rate or --at"
         )

@@ -12,6 +12,7 @@ end. Afterwards the weights before and after are judged on the held-out ends, as
 reconstruct --frame-to-frame` shows them: whole images, of a state that is warm.
 """
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -33,7 +34,7 @@ from firenet_jax.reconstruction import reconstruct
 from firenet_jax.storage import runs
 from firenet_jax.storage.files import identity, write_text
 from firenet_jax.storage.sequence_file import Picture, write_sequence
-from firenet_jax.tensors import capacity, in_groups, pack, voxelise
+from firenet_jax.tensors import in_groups
 from firenet_jax.training import run as training
 from firenet_jax.training.settings import Train
 from firenet_jax.training.step import near_events
@@ -256,24 +257,21 @@ def judged(weights: Weights, one: Cut, near: bool) -> Score:
     times = one.frames.times
     first = int(np.searchsorted(times, times[one.end] - WARM_UP))
     windows = cut(one.recording, Windows(frame_to_frame=True), begin=int(times[first]))
-    numbered = zip(range(first + 1, len(times)), windows, strict=False)
+    windows = itertools.islice(windows, len(times) - first - 1)
     state = initial_state(1, one.recording.height, one.recording.width)
-    seen, scores, size = jnp.zeros((1, *state.g1.shape[:3]), bool), [], 0
-    for group in in_groups(numbered, WINDOWS_AT_ONCE):
-        rows = [[window.events] for _, window in group]
-        rows += [[Events.empty()]] * (WINDOWS_AT_ONCE - len(group))
-        size = capacity(sum(len(row[0]) for row in rows), size)
-        tensors = voxelise(pack(rows, size), height=state.g1.shape[1], width=state.g1.shape[2])
+    seen, scores, number = jnp.zeros((1, *state.g1.shape[:3]), bool), [], first + 1
+    for group, tensors in in_groups(one.recording, windows, WINDOWS_AT_ONCE):
         state, images = reconstruct(weights, state, tensors)
         near_now = near_events(tensors) | seen
         seen = near_now[-1:]
-        later = [k for k, (number, _) in enumerate(group) if number > one.end]
+        later = [k for k in range(len(group)) if number + k > one.end]
         if later:
-            truths = np.stack([one.frame(group[k][0]) for k in later]) / np.float32(255)
+            truths = np.stack([one.frame(number + k) for k in later]) / np.float32(255)
             there = near_now[np.array(later), 0] if near else np.ones(truths.shape, bool)
             chosen = np.clip(images[np.array(later), 0], 0, 1)
             pairs = (chosen, truths), (equalise(chosen, "global"), equalise(truths, "global"))
             scores.append(np.stack([metrics.ssim_where(*pair, there) for pair in pairs], -1))
+        number += len(group)
     found = np.concatenate([np.zeros((0, 2)), *scores])
     found = found[np.isfinite(found).all(1)]  # where no event was near, there is nothing to compare
     return Score(len(found), *map(float, found.mean(0) if len(found) else (np.nan, np.nan)))

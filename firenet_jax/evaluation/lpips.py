@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.errors import SettingsError
+from firenet_jax.evaluation.metrics import root
 from firenet_jax.storage.pytorch_file import identify, read_state_dict, take
 
 MIN_SIDE = 31  # pixels of a side: AlexNet's last pool then makes one of them
@@ -63,10 +64,7 @@ def lpips(weights: Lpips, images: jax.Array, truths: jax.Array) -> jax.Array:
 
 def _unit(features: jax.Array) -> jax.Array:
     """Divided by the norm over channels, whose gradient is infinite at 0 and made 0 there."""
-    square = (features**2).sum(-1, keepdims=True)
-    some = square > 0
-    norm = jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
-    return features / (norm + 1e-10)
+    return features / (root((features**2).sum(-1, keepdims=True)) + 1e-10)
 
 
 # ---- the two networks
@@ -131,15 +129,9 @@ def _pool(x: jax.Array, ceil: bool = False) -> jax.Array:
 
 _SQUEEZENET_SHAPES = {"features.0": (64, 3, 3, 3)}
 for _index, _inputs, _squeezed, _expanded in (
-    (3, 64, 16, 64),
-    (4, 128, 16, 64),
-    (6, 128, 32, 128),
-    (7, 256, 32, 128),
-    (9, 256, 48, 192),
-    (10, 384, 48, 192),
-    (11, 384, 64, 256),
-    (12, 512, 64, 256),
-):
+    (3, 64, 16, 64), (4, 128, 16, 64), (6, 128, 32, 128), (7, 256, 32, 128),
+    (9, 256, 48, 192), (10, 384, 48, 192), (11, 384, 64, 256), (12, 512, 64, 256),
+):  # fmt: skip
     _SQUEEZENET_SHAPES |= {
         f"features.{_index}.squeeze": (_squeezed, _inputs, 1, 1),
         f"features.{_index}.expand1x1": (_expanded, _squeezed, 1, 1),

@@ -168,11 +168,10 @@ def filtered(name: str, settings: high_pass.HighPass = high_pass.HighPass()) -> 
     return Method(name, high_pass.initial_state, step, record)
 
 
-def regularised(name: str, settings: manifold.Manifold = manifold.Manifold()) -> Method:
+def regularised(name: str) -> Method:
     """MR, manifold regularisation."""
-    initial = partial(manifold.initial_state, settings=settings)
-    record = {"method": "mr", **dataclasses.asdict(settings)}
-    return Method(name, initial, partial(manifold.step, settings=settings), record)
+    record = {"method": "mr", **dataclasses.asdict(manifold.Manifold())}
+    return Method(name, manifold.initial_state, manifold.step, record)
 
 
 @jax.jit

@@ -74,7 +74,7 @@ def _gaussian(sigma: float, radius: int) -> np.ndarray:
     return weights / weights.sum()
 
 
-def _root(x: jax.Array) -> jax.Array:
+def root(x: jax.Array) -> jax.Array:
     """The square root, with gradient 0 instead of infinity at 0."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
@@ -82,6 +82,10 @@ def _root(x: jax.Array) -> jax.Array:
 
 def _mean(values: jax.Array) -> jax.Array:
     return values.mean((-2, -1))
+
+
+def _deviation(values: jax.Array) -> jax.Array:
+    return root(_mean((values - _mean(values)[..., None, None]) ** 2))
 
 
 def _compared(image: jax.Array, truth: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -123,11 +127,7 @@ def contrast(image: jax.Array, truth: jax.Array) -> jax.Array:
     rewards as much contrast as the truth has.
     """
     image, truth = _compared(image, truth)
-
-    def deviation(picture):
-        return _root(_mean((picture - _mean(picture)[..., None, None]) ** 2))
-
-    return jnp.abs(deviation(image) - deviation(truth))
+    return jnp.abs(_deviation(image) - _deviation(truth))
 
 
 @partial(jax.jit, static_argnames="data_range")
@@ -249,8 +249,9 @@ def _equalised(image: jax.Array) -> jax.Array:
     return jax.nn.sigmoid((image[..., None] - others) / 0.03).mean(-1)
 
 
-def _power(base: jax.Array, exponent: float, least: float = 1e-3) -> jax.Array:
-    """base^exponent; below `least` the straight line to 0 at 0, below 0 it stays 0."""
+def _power(base: jax.Array, exponent: float) -> jax.Array:
+    """base^exponent; below 0.001 the straight line to 0 at 0, below 0 it stays 0."""
+    least = 1e-3
     line = jnp.maximum(base, 0.0) * least ** (exponent - 1)
     return jnp.where(base > least, jnp.maximum(base, least) ** exponent, line)
 
@@ -266,13 +267,12 @@ def gmsd(image: jax.Array, truth: jax.Array) -> jax.Array:
     """
     image, truth = (_gradient_magnitude(_halved(picture)) for picture in _compared(image, truth))
     constant = 170 / 255**2
-    similarity = (2 * image * truth + constant) / (image**2 + truth**2 + constant)
-    return _root(_mean((similarity - _mean(similarity)[..., None, None]) ** 2))
+    return _deviation((2 * image * truth + constant) / (image**2 + truth**2 + constant))
 
 
 def _gradient_magnitude(image: jax.Array) -> jax.Array:
     mean, difference = (1 / 3, 1 / 3, 1 / 3), (1, 0, -1)
-    return _root(_filter(image, mean, difference) ** 2 + _filter(image, difference, mean) ** 2)
+    return root(_filter(image, mean, difference) ** 2 + _filter(image, difference, mean) ** 2)
 
 
 @jax.jit
@@ -355,7 +355,7 @@ def nlpd(image: jax.Array, truth: jax.Array) -> jax.Array:
                 detail = picture - _enlarged(smaller, *picture.shape[-2:])
             details.append((_divided(detail, band), smaller))
         (of_image, image), (of_truth, truth) = details
-        distance += _root(_mean((of_image - of_truth) ** 2))
+        distance += root(_mean((of_image - of_truth) ** 2))
     return distance / len(NLPD_BANDS)
 
 
@@ -462,22 +462,21 @@ def _complex_similarity(a: list, b: list) -> jax.Array:
         real = _filter(a_real * b_real + a_imaginary * b_imaginary, box, box)
         imaginary = _filter(a_imaginary * b_real - a_real * b_imaginary, box, box)
         power = _filter(a_real**2 + a_imaginary**2 + b_real**2 + b_imaginary**2, box, box)
-        modulus = _root(real**2 + imaginary**2)
+        modulus = root(real**2 + imaginary**2)
         similarity += _mean((2 * modulus + constant) / (power + constant))
     return similarity / len(a)
 
 
-@partial(jax.jit, static_argnames="seed")
-def random_features(image: jax.Array, truth: jax.Array, *, seed: int = 0) -> jax.Array:
+@jax.jit
+def random_features(image: jax.Array, truth: jax.Array) -> jax.Array:
     """Distance between the features of a fixed random network, 0 to 2; sees a negative.
 
     mean_l mean_xy sum_c (n_l(I) - n_l(G))^2 as LPIPS (Zhang et al. 2018) with all weights 1, n_l
     the features of layer l divided by their norm over channels. Three layers of halving, 3x3
     convolution and ReLU (16, 32, 64 channels, He normal weights); the first halving turns 2x2
     pixels into 4 channels, the others take means. Liu et al. 2021 train with such features.
-    seed: of the network; only values with the same seed are comparable.
     """
-    kernels = random_kernels(seed)
+    kernels = random_kernels(seed=0)
     both = (_random_layers(kernels, picture) for picture in _compared(image, truth))
     layers = [_mean(((a - b) ** 2).sum(-1)) for a, b in zip(*both, strict=True)]
     return sum(layers, jnp.float32(0)) / len(layers)
@@ -594,4 +593,4 @@ def event_correlation(image: jax.Array, votes: jax.Array) -> jax.Array:
     fit = (c * p**2 - 2 * b * p * q + a * q**2) / (a * c - b**2)
     total = summed(votes**2).sum((-2, -1))
     part = fit.sum((-2, -1)) / jnp.where(total > 0, total, 1.0)
-    return _root(jnp.clip(part, 0.0, 1.0))
+    return root(jnp.clip(part, 0.0, 1.0))

@@ -37,7 +37,7 @@ from firenet_jax.evaluation.results import Measured
 from firenet_jax.events import Frames, Recording
 from firenet_jax.filters import check_span
 from firenet_jax.instants import Step, steps
-from firenet_jax.settings import check_seed
+from firenet_jax.settings import check_seed, check_sizes
 from firenet_jax.storage.files import named
 from firenet_jax.storage.overlap import ahead
 from firenet_jax.windows import Window, Windows, cut, in_words, usual
@@ -78,10 +78,7 @@ class Protocol:
             raise SettingsError(
                 "keep ratio thins out frames: it varies windows between frames only"
             )
-        for name in ("warm_up", "tolerance"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise SettingsError(f"{name} is {value}, but must be 0 or more")
+        check_sizes(self, "warm_up", "tolerance", zero=True)
         check_seed(self.seed)
         check_span(self.start, self.stop)
 

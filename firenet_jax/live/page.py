@@ -151,6 +151,5 @@ def serve(board: Board, figures: Callable[[], dict], title: str, port: int) -> T
                 super().handle_error(request, client_address)
 
     server = Server(("127.0.0.1", port), Handler)
-    server.daemon_threads = True
     threading.Thread(target=server.serve_forever, daemon=True).start()
     return server

@@ -103,7 +103,7 @@ def open_recording(
         frames=source.frames,
         inferred=size is None,
         grey=source.grey,
-        triggers=lambda: _in_order(source.triggers()),
+        triggers=source.triggers,
     )
 
 
@@ -132,14 +132,6 @@ def _source(path: Path, sensor_size: tuple[int, int] | None, columns: str | None
         "an ECD or EVREAL folder, HDF5, .npy, .npz, N-Caltech101 .bin, .dat, .raw, .aedat, "
         ".aedat4, .es, or a ROS bag"
     )
-
-
-def _in_order(triggers: Triggers | None) -> Triggers | None:
-    if triggers is None or not len(triggers.times):
-        return None
-    order = np.argsort(triggers.times, kind="stable")
-    times, ids, polarity = (np.asarray(column)[order] for column in triggers)
-    return Triggers(times.astype(np.int64), ids.astype(np.int64), polarity.astype(bool))
 
 
 def _stated(path: Path, source: Source) -> tuple[int, int] | None:
@@ -200,8 +192,8 @@ def joined(chunks: Iterable[Events | Rows], least: int = CHUNK // 4) -> Iterator
 
 
 def all_triggers(pieces: Iterable[Iterable], *errors: type[BaseException]) -> Triggers | None:
-    """Pieces of (times in microseconds, ids, polarity) -> all of them, up to a RecordingError or
-    one of `errors`; None if there are no pieces."""
+    """Pieces of (times in microseconds, ids, polarity) -> all of them in time order, up to a
+    RecordingError or one of `errors`; None if there are none."""
     columns = [[], [], []]
     try:
         for piece in pieces:
@@ -209,10 +201,11 @@ def all_triggers(pieces: Iterable[Iterable], *errors: type[BaseException]) -> Tr
                 column.append(np.asarray(values, np.int64))
     except (RecordingError, *errors):
         pass  # reading the events raises it
-    if not columns[0]:
+    if not any(map(len, columns[0])):
         return None
     times, ids, polarity = map(np.concatenate, columns)
-    return Triggers(times, ids, polarity > 0)
+    order = np.argsort(times, kind="stable")
+    return Triggers(times[order], ids[order], polarity[order] > 0)
 
 
 def microseconds(seconds: np.ndarray) -> np.ndarray:

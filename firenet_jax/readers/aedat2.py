@@ -56,11 +56,7 @@ class Layout(NamedTuple):
 DAVIS = Layout(12, 10, 22, 9, 11, 1, 1 << 10, True, ((180, 240), (260, 346), (480, 640)))
 DVS128 = Layout(1, 7, 8, 7, 0, 0, 1 << 15 | 1 << 31, False, ((128, 128),))
 DVS640 = Layout(1, 10, 11, 10, 0, 1, 0, False, ((480, 640),))
-CHIPS = {
-    r"davis|sbret|dvs240|dvs346": DAVIS,
-    r"dvs128|tmpdiff128": DVS128,
-    r"dvs640": DVS640,
-}
+CHIPS = {r"davis|sbret|dvs240|dvs346": DAVIS, r"dvs128|tmpdiff128": DVS128, r"dvs640": DVS640}
 
 
 class File(NamedTuple):
@@ -263,16 +259,8 @@ def _scans(
             continue
         rows = of_kind[begin:end]
         t = time[rows]
-        pieces.append(
-            Scan(
-                number + int(rows[0]),
-                number + int(rows[-1]),
-                len(rows),
-                int(t[0]),
-                int(t[-1]),
-                int((t - t[0]).sum()),
-            )  # fmt: skip
-        )
+        facts = number + rows[0], number + rows[-1], len(rows), t[0], t[-1], (t - t[0]).sum()
+        pieces.append(Scan(*map(int, facts)))
     return pieces, place[-1]
 
 

@@ -140,23 +140,19 @@ def _layout(path: Path) -> Layout:
             raise RecordingError(f"{damaged} ({error}): {remedy}") from error
     if codec not in CODECS:
         raise RecordingError(f"{damaged} (compression {codec}): {remedy}")
-    events = [number for number, (kind, _) in streams.items() if kind == "EVTS"]
-    if not events:
-        kinds = ", ".join(sorted({kind for kind, _ in streams.values()})) or "nothing"
+    first = {kind: number for number, (kind, _) in reversed(streams.items())}
+    if "EVTS" not in first:
+        kinds = ", ".join(sorted(first)) or "nothing"
         raise RecordingError(f"{path}: holds no events, but {kinds}: record them too")
-    frames, triggers = (
-        [number for number, (kind, _) in streams.items() if kind == wanted]
-        for wanted in ("FRME", "TRIG")
-    )
     return Layout(
         CODECS[codec],
         begin,
         end if end >= begin else None,
-        events[0],
-        frames[0] if frames else None,
-        streams[events[0]][1],
+        first["EVTS"],
+        first.get("FRME"),
+        streams[first["EVTS"]][1],
         b">DVXplorer_" in header,
-        triggers[0] if triggers else None,
+        first.get("TRIG"),
     )
 
 

@@ -22,26 +22,14 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Rows, Triggers
-from firenet_jax.readers import (
-    CHUNK,
-    Source,
-    all_triggers,
-    evt2,
-    evt3,
-    extra,
-    joined,
-    to_events,
-)
+from firenet_jax.readers import CHUNK, Source, all_triggers, evt2, evt3, extra, joined, to_events
 from firenet_jax.readers.dat import header_size, read_header
 
 FORMATS = {".raw": "Prophesee raw", ".es": "Event Stream"}
 WORD = {"2": 4, "2.0": 4, "2.1": 8, "21": 8, "3": 2, "3.0": 2}  # EVT version: bytes of a word
 EVT3 = np.dtype("<u2")
 # of triggers, by EVT version: function, state at the beginning, type of a word
-DECODERS = {
-    "2": (evt2.triggers, -1, np.dtype("<u4")),
-    "3": (evt3.triggers, evt3.State(), EVT3),
-}
+DECODERS = {"2": (evt2.triggers, -1, np.dtype("<u4")), "3": (evt3.triggers, evt3.State(), EVT3)}
 LATE = 4094  # from here on faery takes the first time high of an EVT3 file for a fall from 0
 LARGEST = (2048, 2048)  # what EVT's 11 bits reach, so that faery refuses nothing
 

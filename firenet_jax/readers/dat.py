@@ -13,7 +13,6 @@ import re
 from collections.abc import Iterator
 from io import BufferedReader
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,14 +21,7 @@ from firenet_jax.events import Events, Rows
 from firenet_jax.readers import CHUNK, Source, to_events, unwrap
 
 TYPES = (0x00, 0x0C)
-
-
-class Layout(NamedTuple):
-    x_bits: int
-    y_bits: int
-
-
-VERSIONS = {0: Layout(9, 8), 1: Layout(9, 8), 2: Layout(14, 14)}
+VERSIONS = {0: (9, 8), 1: (9, 8), 2: (14, 14)}  # bits of x, and of y
 
 
 def matches(path: Path) -> bool:
@@ -53,10 +45,9 @@ def read(path: Path) -> Source:
     if version not in VERSIONS:
         raise RecordingError(f"{path}: is of version {version}, expected 0, 1 or 2")
     count, left = divmod(path.stat().st_size - start, 8)
-    layout = VERSIONS[version]
-    size = header_size(header)
+    size, bits = header_size(header), VERSIONS[version]
     return Source(
-        "Prophesee DAT", lambda: _events(path, start, count, layout, left), size, count, grey=True
+        "Prophesee DAT", lambda: _events(path, start, count, bits, left), size, count, grey=True
     )
 
 
@@ -86,19 +77,19 @@ def header_size(header: str) -> tuple[int, int] | None:
 
 
 def _events(
-    path: Path, start: int, count: int, layout: Layout, left: int
+    path: Path, start: int, count: int, bits: tuple[int, int], left: int
 ) -> Iterator[Events | Rows]:
-    """left: bytes of an event that is not whole, at the end"""
-    row, last = 0, 0
+    """bits: of x, and of y; left: bytes of an event that is not whole, at the end"""
+    row, last, (x_bits, y_bits) = 0, 0, bits
     with open(path, "rb") as file:
         file.seek(start)
         # Not to the end: a file that is still being written may end within an event by now.
         while data := file.read(8 * min(CHUNK, count - row)):
             t, fields = np.frombuffer(data, "<u4").reshape(-1, 2).T
             t = unwrap(t, 32, last)
-            x = fields & ((1 << layout.x_bits) - 1)
-            y = fields >> layout.x_bits & ((1 << layout.y_bits) - 1)
-            p = fields >> (layout.x_bits + layout.y_bits) & 1
+            x = fields & ((1 << x_bits) - 1)
+            y = fields >> x_bits & ((1 << y_bits) - 1)
+            p = fields >> (x_bits + y_bits) & 1
             yield to_events(path, row, t, x, y, p)
             row, last = row + len(t), int(t[-1])
     if left:

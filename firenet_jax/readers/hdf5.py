@@ -24,15 +24,7 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Frames, Rows
-from firenet_jax.readers import (
-    Source,
-    extra,
-    frame_times,
-    in_chunks,
-    reading,
-    to_events,
-    to_frame,
-)
+from firenet_jax.readers import Source, extra, frame_times, in_chunks, reading, to_events, to_frame
 from firenet_jax.storage.files import check_readable
 
 Read = Callable[[slice], Events | Rows]
@@ -115,14 +107,8 @@ def _reader(path: Path, file: Any, layout: str) -> tuple[Read, int]:
             raise RecordingError(
                 f"{path}: {events.name.strip('/')} has the shape {events.shape}, expected (N, 4)"
             )
-
-        order = "xytp" if layout == "MVSEC" else "txyp"
-
-        def read_table(rows: slice) -> Events | Rows:
-            columns = dict(zip(order, events[rows].T, strict=True))
-            return to_events(path, rows.start, *(columns[name] for name in "txyp"))
-
-        return read_table, len(events)
+        order = [2, 0, 1, 3] if layout == "MVSEC" else [0, 1, 2, 3]
+        return lambda rows: to_events(path, rows.start, *events[rows].T[order]), len(events)
     if layout == "Metavision":
         events = file[METAVISION]
         _check_stored(path, events)

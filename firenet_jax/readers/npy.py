@@ -17,22 +17,15 @@ The files are memory-mapped and sliced as the events are asked for; but an .npz 
 
 import json
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Frames, Rows
-from firenet_jax.readers import (
-    Source,
-    frame_times,
-    in_chunks,
-    reading,
-    text,
-    to_events,
-    to_frame,
-)
+from firenet_jax.readers import Source, frame_times, in_chunks, reading, text, to_events, to_frame
 
 # layout: files of times, coordinates, polarities, frame times
 FILES = {
@@ -59,7 +52,7 @@ def read(path: Path, columns: str | None = None) -> Source:
         text.warn_of_whole_seconds(path, t, "store them as integers: a structured array, or .npz")
         return Source(
             f"numpy {path.suffix.lower()}",
-            lambda: _rows(path, _of_one_file(path, order)),
+            lambda: _rows(path, partial(_of_one_file, path, order)),
             _sides(path),
             len(t),
         )
@@ -67,12 +60,13 @@ def read(path: Path, columns: str | None = None) -> Source:
         raise RecordingError(
             f"{path}: has a file for each column, and so no order of columns: leave out --columns"
         )
-    t, _, _ = _columns(path, layout)
+    t, *_ = _columns(path, layout)
     frames = _frames(path, layout)
     size = _size(path)
     if size is None and frames is not None:
         size = frames.read(0).shape
-    return Source(f"{layout} folder", lambda: _events(path, layout), size, len(t), frames)
+    opened = partial(_columns, path, layout)
+    return Source(f"{layout} folder", lambda: _rows(path, opened), size, len(t), frames)
 
 
 def _layout(path: Path) -> str | None:
@@ -85,6 +79,7 @@ def _mapped(path: Path) -> np.ndarray:
 
 
 def _columns(path: Path, layout: str) -> list[np.ndarray]:
+    """-> t, x, y, p"""
     t, xy, p = (_mapped(path / name) for name in FILES[layout][:3])
     t, p = (column[:, 0] if column.ndim == 2 else column for column in (t, p))
     if not (t.shape == p.shape == xy.shape[:1] and xy.shape[1:] == (2,)):
@@ -92,7 +87,7 @@ def _columns(path: Path, layout: str) -> list[np.ndarray]:
             f"{path}: its columns do not fit together: t {t.shape}, xy {xy.shape}, p {p.shape}, "
             "expected (N,), (N, 2) and (N,)"
         )
-    return [t, xy, p]
+    return [t, *xy.T, p]
 
 
 def _order(path: Path, columns: str) -> list[str]:
@@ -160,20 +155,13 @@ def _named(path: Path, arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
     return found
 
 
-def _rows(path: Path, columns: list[np.ndarray]) -> Iterator[Events | Rows]:
+def _rows(path: Path, opened: Callable[[], list[np.ndarray]]) -> Iterator[Events | Rows]:
+    columns = opened()
+
     def read(rows: slice) -> Events | Rows:
         return to_events(path, rows.start, *(column[rows] for column in columns))
 
     yield from in_chunks(read, len(columns[0]))
-
-
-def _events(path: Path, layout: str) -> Iterator[Events | Rows]:
-    t, xy, p = _columns(path, layout)
-
-    def read(rows: slice) -> Events | Rows:
-        return to_events(path, rows.start, t[rows], xy[rows, 0], xy[rows, 1], p[rows])
-
-    yield from in_chunks(read, len(t))
 
 
 def _frames(path: Path, layout: str) -> Frames | None:

@@ -179,17 +179,16 @@ class _Message:
         """The next unsigned integer, of so many bytes."""
         if self.ros2:
             self.at += -(self.at - self.start) % size
-        self.at += size
-        if self.at > len(self.raw):
-            raise ValueError("a message ends too early")
-        return int.from_bytes(self.raw[self.at - size : self.at], ORDERS[self.order])
+        return int.from_bytes(self._next(size), ORDERS[self.order])
 
-    def bytes(self) -> bytes:
-        size = self.number(4)
+    def _next(self, size: int) -> bytes:
         self.at += size
         if self.at > len(self.raw):
             raise ValueError("a message ends too early")
         return self.raw[self.at - size : self.at]
+
+    def bytes(self) -> bytes:
+        return self._next(self.number(4))
 
     def text(self) -> str:
         return bytes(self.bytes()).rstrip(b"\0").decode()

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from firenet_jax.errors import SettingsError
-from firenet_jax.simulation.scenes import Scene, SceneSettings, random_scene
+from firenet_jax.simulation.scenes import Scene, SceneSettings, log_uniform, random_scene
 from firenet_jax.simulation.sensor import (
     Sensor,
     SensorSettings,
@@ -58,17 +58,7 @@ def check_motion(motion: tuple[float, float], renderings: int) -> None:
 
 @partial(
     jax.jit,
-    static_argnames=(
-        "batch",
-        "height",
-        "width",
-        "renderings",
-        "motion",
-        "slow",
-        "swift",
-        "scene",
-        "sensor",
-    ),
+    static_argnames="batch height width renderings motion slow swift scene sensor".split(),
 )
 def random_setups(
     key: jax.Array,
@@ -139,11 +129,6 @@ def _paces(
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """(2, B) uniform numbers -> pixels per second, window duration, whether slow, whether swift;
     (B,) each. The other arguments are those of `random_setups`."""
-
-    def log_uniform(bounds, numbers):
-        low, high = (math.log(bound) for bound in bounds)
-        return jnp.exp(low + (high - low) * numbers)
-
     speed, kind = log_uniform(speeds, numbers[0]), numbers[1]
     is_slow, is_swift = kind < slow, kind >= 1 - swift
     pixels = log_uniform(motion, jnp.clip((kind - slow) / (1 - slow - swift), 0, 1))
@@ -181,9 +166,8 @@ def _noisy_at_rest(
         return sensors
     seconds = 1e-6 * duration
     stopped = scenes.pauses[:, 0, 1] - scenes.pauses[:, 0, 0] > windows * seconds
-    low, high = (math.log(bound) for bound in AT_REST)
     noisy, share = jax.random.uniform(key, (2, len(duration)))
-    rate = jnp.exp(low + (high - low) * share) / seconds
+    rate = log_uniform(AT_REST, share) / seconds
     chosen = stopped & (noisy < 0.5)
     drawn = noisy < 0.25
     uniform = jnp.stack([rate, jnp.ones_like(rate), drawn.astype(rate.dtype)], -1)
@@ -205,13 +189,7 @@ def window_bounds(durations: jax.Array, windows: int, first: jax.Array | int = 0
 
 
 def sequences(
-    key: jax.Array,
-    textures: jax.Array,
-    *,
-    height: int,
-    width: int,
-    renderings: int = 5,
-    **settings,
+    key: jax.Array, textures: jax.Array, *, height: int, width: int, renderings: int = 5, **settings
 ) -> Simulation:
     """key, textures (N, S, S) -> training data; `settings` are those of `random_setups`."""
     shared = {"height": height, "width": width, "renderings": renderings}

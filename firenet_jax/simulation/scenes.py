@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.errors import SettingsError
+from firenet_jax.pictures import blurred
 from firenet_jax.settings import check_range
 from firenet_jax.warp import sample
 
@@ -238,6 +239,12 @@ def _pauses(uniform, duration, settings: SceneSettings) -> jax.Array:
     return pauses
 
 
+def log_uniform(bounds: tuple[float, float], numbers: jax.Array) -> jax.Array:
+    """Uniform numbers in [0, 1) -> log-uniform ones between the bounds."""
+    low, high = (math.log(bound) for bound in bounds)
+    return jnp.exp(low + (high - low) * numbers)
+
+
 def _dice(key: jax.Array, count: int):
     """key -> two functions (bounds, shape) -> random numbers, uniform and log-uniform.
 
@@ -328,16 +335,7 @@ def _blurred(image: jax.Array, sigma: jax.Array) -> jax.Array:
     """(S, S) -> the same under a Gaussian of this many pixels, mirrored at the border."""
     distance = jnp.arange(-BLUR, BLUR + 1, dtype=jnp.float32)
     weights = jnp.exp(-0.5 * (distance / sigma) ** 2)
-    weights = weights / weights.sum()
-    for axis in (0, 1):
-        padded = jnp.pad(image, [(BLUR * (a == axis),) * 2 for a in (0, 1)], mode="reflect")
-        size = image.shape[axis]
-        shifted = (
-            weights[k] * jax.lax.slice_in_dim(padded, k, k + size, axis=axis)
-            for k in range(2 * BLUR + 1)
-        )
-        image = sum(shifted, jnp.zeros_like(image))
-    return image
+    return blurred(image, weights / weights.sum(), "reflect")
 
 
 def _outline(key: jax.Array) -> jax.Array:

@@ -35,8 +35,8 @@ from jax.typing import ArrayLike
 
 from firenet_jax.errors import SettingsError
 from firenet_jax.events import BINS, Events, concatenate
-from firenet_jax.settings import check_range
-from firenet_jax.simulation.scenes import Scene, flow, render
+from firenet_jax.settings import check_range, check_share, check_sizes
+from firenet_jax.simulation.scenes import Scene, flow, log_uniform, render
 
 EPS = 0.001
 THRESHOLD, SPREAD, REFRACTORY = 0.18, 0.03, 1e-3  # defaults, as in the paper
@@ -124,30 +124,23 @@ class SensorSettings:
                 raise SettingsError(
                     f"flicker is {self.flicker}, but light is not negative: at most 1"
                 )
-        if not 0 <= self.clean <= 1:
-            raise SettingsError(f"clean is {self.clean}, but is a part of the sequences, 0-1")
+        check_share("clean", self.clean, "sequences")
         if _on(self.hot) and self.hot[1] > 1:
             raise SettingsError(f"hot is {self.hot}, but is a part of the pixels: at most 1")
-        if self.threshold is not None and not 0 < self.threshold < math.inf:
-            raise SettingsError(f"threshold is {self.threshold}, but must be more than 0")
-        for name in ("threshold_spread", "asymmetry", "refractory", "mismatch", "cutoff_dark"):
-            value = getattr(self, name)
-            if value is not None and not (value >= 0 and math.isfinite(value)):
-                raise SettingsError(f"{name} is {value}, but must be 0 or more")
+        check_sizes(self, "threshold")
+        others = "threshold_spread", "asymmetry", "refractory", "mismatch", "cutoff_dark"
+        check_sizes(self, *others, zero=True)
         longest = max(self.refractory or 0, *(self.refractory_range or (0, 0)))
         if longest > MAX_INTERVAL * 1e-6:
             raise SettingsError(
                 f"a refractory period of {longest:g} s, but at most {MAX_INTERVAL * 1e-6:.1f} s"
             )
         # A range takes precedence, so the other value would silently be ignored.
+        fixed = "for a fixed one pass --{}-range VALUE VALUE"
         for name, owner, remedy in (
-            ("threshold", "threshold_range", "for a fixed one pass --threshold-range VALUE VALUE"),
+            ("threshold", "threshold_range", fixed.format("threshold")),
             ("threshold_spread", "threshold_range", "pass --asymmetry"),
-            (
-                "refractory",
-                "refractory_range",
-                "for a fixed one pass --refractory-range VALUE VALUE",
-            ),
+            ("refractory", "refractory_range", fixed.format("refractory")),
         ):
             if None not in (getattr(self, owner), getattr(self, name)):
                 raise SettingsError(f"{name} has no effect beside {owner}: {remedy}")
@@ -237,15 +230,11 @@ def random_sensor(
     numbers = iter(jax.random.uniform(number_key, (6,)))
     spread = jax.random.normal(spread_key, (2,))
 
-    def log_uniform(bounds):
-        low, high = (math.log(bound) for bound in bounds)
-        return jnp.exp(low + (high - low) * next(numbers))
-
     if settings.threshold_range is None:
         mean, deviation = _or(settings.threshold, THRESHOLD), _or(settings.threshold_spread, SPREAD)
         on, off = mean + deviation * spread
     else:
-        on = log_uniform(settings.threshold_range)
+        on = log_uniform(settings.threshold_range, next(numbers))
         off = on * (1 + settings.asymmetry * spread[0])
     if _on(settings.mismatch):
         own = settings.mismatch * jax.random.normal(mismatch_key, (2, *shape))
@@ -258,26 +247,27 @@ def random_sensor(
     if _on(settings.leak) or _on(settings.hot):
         drift = jnp.zeros(shape)
         if _on(settings.leak):
-            drift += on * log_uniform(settings.leak)
+            drift += on * log_uniform(settings.leak, next(numbers))
         if _on(settings.hot):
             rate = 10.0 * 50.0**rate * jnp.where(sign < 0.5, on, -off)
-            drift = jnp.where(chance < log_uniform(settings.hot), rate, drift)
+            share = log_uniform(settings.hot, next(numbers))
+            drift = jnp.where(chance < share, rate, drift)
     start = None
     if settings.mid_recording:
         start = jax.random.uniform(jax.random.fold_in(key, 1), shape, minval=-off, maxval=on)
     if settings.refractory_range is not None:
-        refractory = log_uniform(settings.refractory_range)
+        refractory = log_uniform(settings.refractory_range, next(numbers))
     else:
         refractory = jnp.float32(_or(settings.refractory, REFRACTORY))
     silenced = settings.refractory_range is not None or settings.refractory != 0
     noise = slope = cutoff = None
     if _on(settings.noise):
-        noise = jnp.stack([log_uniform(settings.noise), NOISE_IN_LIGHT, 0.0])
+        noise = jnp.stack([log_uniform(settings.noise, next(numbers)), NOISE_IN_LIGHT, 0.0])
         if settings.noise_in_light is not None:
             low, high = map(math.log, settings.noise_in_light)
             slope = jax.random.uniform(jax.random.fold_in(key, 4), minval=low, maxval=high)
     if _on(settings.cutoff):
-        cutoff = jnp.stack([log_uniform(settings.cutoff), settings.cutoff_dark])
+        cutoff = jnp.stack([log_uniform(settings.cutoff, next(numbers)), settings.cutoff_dark])
     refractory = jnp.round(refractory * 1e6 * TICKS).astype(jnp.int32) if silenced else None
     lamp = _lamp(jax.random.fold_in(key, 3), shape, settings.flicker)
     sensor = Sensor(on, off, refractory, drift, noise, slope, cutoff, phase, start, lamp, noise_key)
@@ -295,11 +285,6 @@ def _lamp(
     if not _on(flicker):
         return None
     numbers = jax.random.uniform(key, (6,))
-
-    def log_uniform(bounds, number):
-        low, high = (math.log(bound) for bound in bounds)
-        return jnp.exp(low + (high - low) * number)
-
     y, x = (jnp.arange(length) / max(shape) for length in shape)
     down, across = (y - numbers[0] * y[-1]) ** 2, (x - numbers[1] * x[-1]) ** 2
     away = (down[:, None] + across[None]) / log_uniform(REACH, numbers[3]) ** 2

@@ -159,7 +159,7 @@ def _read_old(content: bytes) -> dict[str, np.ndarray]:
     for key in keys:
         storage = storages[key]
         (count,) = struct.unpack("<q", stream.read(8))
-        size = storage.total * storage.itemsize
+        size = storage.total * storage.type.itemsize
         left = len(content) - stream.tell()
         if count != storage.total or size > left:
             raise CheckpointError(
@@ -220,10 +220,6 @@ class _Storage:
     start: int  # the part of it that this one is, in elements: an old file may hold views
     count: int
 
-    @property
-    def itemsize(self) -> int:
-        return self.type.itemsize
-
 
 @dataclass(frozen=True, eq=False)
 class _Tensor:
@@ -253,14 +249,14 @@ def _arrays(
         at = (storage.key, tensor.type.code)
         if at not in cache:
             data = storage_bytes(storage.key)
-            if len(data) != storage.total * storage.itemsize:
+            if len(data) != storage.total * storage.type.itemsize:
                 raise CheckpointError(
                     f"is damaged or cut short (storage {_shown(storage.key)} holds {len(data)} "
-                    f"bytes, expected {storage.total * storage.itemsize}); {AGAIN}"
+                    f"bytes, expected {storage.total * storage.type.itemsize}); {AGAIN}"
                 )
             cache[at] = _decode(data, tensor.type, order)
-        first = storage.start * storage.itemsize // tensor.type.itemsize
-        count = storage.count * storage.itemsize // tensor.type.itemsize
+        first = storage.start * storage.type.itemsize // tensor.type.itemsize
+        count = storage.count * storage.type.itemsize // tensor.type.itemsize
         return cache[at][first : first + count]
 
     named = {}
@@ -369,21 +365,8 @@ _STORAGES = {
     "BoolStorage": "b1",
     "UntypedStorage": "u1",
 }
-_DTYPES = {
-    "float32": "f4",
-    "float64": "f8",
-    "float16": "f2",
-    "bfloat16": "V2",
-    "uint8": "u1",
-    "uint16": "u2",
-    "uint32": "u4",
-    "uint64": "u8",
-    "int8": "i1",
-    "int16": "i2",
-    "int32": "i4",
-    "int64": "i8",
-    "bool": "b1",
-}
+_NUMBERS = "float16 float32 float64 uint8 uint16 uint32 uint64 int8 int16 int32 int64 bool".split()
+_DTYPES = {name: np.dtype(name).str[1:] for name in _NUMBERS} | {"bfloat16": "V2"}
 # Neighbours of the weights in published checkpoints; nothing of them is needed.
 _HARMLESS = [
     "parse_config.ConfigParser",  # event_cnn_minimal (FireNet+, E2VID+) saves its configuration

@@ -24,6 +24,7 @@ from PIL import Image
 from firenet_jax.errors import OutputError, logger
 from firenet_jax.storage import bag
 from firenet_jax.storage.files import lock_file, locked, partial_name, writing
+from firenet_jax.storage.runs import make_folder
 
 VIDEOS = (".mp4", ".gif")
 WHOLE = (*VIDEOS, ".h5", ".bag", ".ros2")  # made in one go; all else is a folder of png
@@ -112,12 +113,7 @@ def check_output(path: Path, overwrite: bool) -> None:
             raise OutputError(
                 f"{path} holds {strange}, which this program did not write: choose another output"
             )
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"{path.parent}: cannot make this folder ({error.strerror}): choose another output"
-        ) from error
+    make_folder(path.parent)
     if not os.access(path.parent, os.W_OK):
         raise OutputError(f"{path.parent} is not writable: choose another output")
 

@@ -29,6 +29,7 @@ from firenet_jax.errors import RecordingError, SettingsError, logger
 from firenet_jax.events import BINS, Events, Rows, checked, concatenate, counted, event_number
 from firenet_jax.readers import CHUNK, frame_times, to_events, to_frame
 from firenet_jax.readers.hdf5 import in_order, opened
+from firenet_jax.settings import check_sizes
 from firenet_jax.simulation.sensor import Simulation
 from firenet_jax.storage.files import files_in
 from firenet_jax.tensors import Packed, pack, voxelise
@@ -61,8 +62,7 @@ class Augment:
         for name in ("flip", "pauses", "stay", "hot_pixels"):
             if not 0 <= getattr(self, name) <= 1:
                 raise SettingsError(f"{name} is {getattr(self, name)}, but must be between 0 and 1")
-        if not 0 <= self.voxel_noise < np.inf:
-            raise SettingsError(f"voxel_noise is {self.voxel_noise}, but must be 0 or more")
+        check_sizes(self, "voxel_noise", zero=True)
 
 
 NO_AUGMENT = Augment(flip=0.0, pauses=0.0, hot_pixels=0.0, voxel_noise=0.0)

@@ -38,10 +38,7 @@ finally:
 
 
 class Log:
-    """A run's record: log.jsonl, TensorBoard, pictures, weights; written by the first process.
-
-    Lines beyond the checkpoint from which a run goes on are dropped.
-    """
+    """A run's record in its folder; step: of the checkpoint from which it goes on, or 0."""
 
     def __init__(self, folder: Path, step: int):
         self.path, self.start = folder / "log.jsonl", time.monotonic()

@@ -10,14 +10,13 @@ weighted sum of distances that need none, by default about as large as LPIPS of 
 reconstruction (0.4 to 0.5), so that lambda_TC has the same meaning.
 """
 
-import math
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 
-from firenet_jax.errors import SettingsError
 from firenet_jax.evaluation import metrics
+from firenet_jax.settings import check_sizes
 
 
 @dataclass(frozen=True)
@@ -67,9 +66,7 @@ class Loss:
     """Last image of a sequence, counted from 0."""
 
     def __post_init__(self):
-        for name in (*DISTANCES, "detail", "lambda_tc", "l0", "L"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise SettingsError(f"{name} is {getattr(self, name)}, but must be 0 or more")
+        check_sizes(self, *DISTANCES, "detail", "lambda_tc", "l0", "L", zero=True)
 
 
 MAX_STILL_MOTION = 0.3  # pixels: `detail` counts for images after at most this much motion

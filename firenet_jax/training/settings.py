@@ -5,7 +5,6 @@ into another folder does not recompile.
 """
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,7 +13,7 @@ import tyro
 
 from firenet_jax.devices import check_processes
 from firenet_jax.errors import SettingsError
-from firenet_jax.settings import check_range, check_seed
+from firenet_jax.settings import check_range, check_seed, check_share, check_sizes
 from firenet_jax.simulation.curricula import LONGEST_WINDOW, check_motion, check_rare
 from firenet_jax.simulation.scenes import SceneSettings
 from firenet_jax.simulation.sensor import FAULTY, SensorSettings
@@ -119,21 +118,8 @@ class Train:
     sensor: SensorSettings = dataclasses.replace(FAULTY, threshold_range=(0.1, 0.6))
 
     def __post_init__(self):
-        positive = (
-            "textures",
-            "steps",
-            "batch",
-            "crop",
-            "chain",
-            "renderings",
-            "learning_rate",
-            "clip",
-            "log_every",
-            "validate_every",
-        )
-        for name in positive:
-            if not 0 < getattr(self, name) < math.inf:
-                raise SettingsError(f"{name} is {getattr(self, name)}, but must be more than 0")
+        check_sizes(self, "textures", "steps", "batch", "crop", "chain", "renderings")
+        check_sizes(self, "learning_rate", "clip", "log_every", "validate_every")
         if not self.loss.l0 < self.windows <= self.loss.L + 1:
             raise SettingsError(
                 f"windows is {self.windows}, but must be more than --l0 ({self.loss.l0}) and at "
@@ -148,10 +134,7 @@ class Train:
         check_range("motion", self.motion)
         _check_step(self)
         check_rare(self.slow, self.swift)
-        if not 0 <= self.to_and_fro <= 1:
-            raise SettingsError(
-                f"to_and_fro is {self.to_and_fro}, but is a part of the sequences, 0-1"
-            )
+        check_share("to_and_fro", self.to_and_fro, "sequences")
         if self.to_and_fro and self.windows % 2:
             raise SettingsError(
                 f"windows is {self.windows}, but as many lead to and fro: choose an even number"
@@ -159,10 +142,7 @@ class Train:
         check_seed(self.seed)
         if not self.save_every >= 0:
             raise SettingsError(f"save_every is {self.save_every} seconds, but must be 0 or more")
-        if not 0 <= self.procedural <= 1:
-            raise SettingsError(
-                f"procedural is {self.procedural}, but is a part of the textures, 0-1"
-            )
+        check_share("procedural", self.procedural, "textures")
         if not 0 <= warming_up(self) < self.steps:
             raise SettingsError(
                 f"warmup is {self.warmup} steps of {self.steps}: use 0 or more, fewer"

@@ -90,11 +90,7 @@ def optimiser(settings: StepSettings) -> optax.GradientTransformation:
     Biases and the 1x1 convolution always use Adam.
     """
     rate = optax.warmup_cosine_decay_schedule(
-        0.0,
-        settings.learning_rate,
-        settings.warmup,
-        settings.steps,
-        settings.learning_rate / 100,
+        0.0, settings.learning_rate, settings.warmup, settings.steps, settings.learning_rate / 100
     )
     update = optax.adam(rate)
     if settings.optimiser == "muon":
