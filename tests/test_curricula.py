@@ -76,6 +76,7 @@ def test_rare_sequences_are_slow_and_calm_or_swift_before_a_blank_ground(texture
         made(slow=0.6, swift=0.4)
 
 
+@pytest.mark.slow
 def test_no_window_is_so_short_that_more_than_a_pixel_passes_between_renderings(textures):
     """The shortest is a millisecond, in which the fastest would move by a hundred pixels."""
     scene = replace(SETTINGS["scene"], speed=(1e5, 1e5))

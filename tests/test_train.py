@@ -240,6 +240,7 @@ def test_sequences_of_a_batch_are_of_different_ages_and_go_on_where_they_were(tm
     assert not np.allclose(seen[6:, 0], first[6:, 0], atol=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.optimised
 def test_sequences_to_and_fro_are_the_same_windows_in_every_step(tmp_path):
     asked = tiny(tmp_path, chain=4, windows=6, to_and_fro=1.0, loss=Loss(l0=2))
@@ -254,30 +255,39 @@ def test_sequences_to_and_fro_are_the_same_windows_in_every_step(tmp_path):
     assert not np.allclose(seen[1][:, 0], seen[2][:, 0], atol=0.5)
 
 
-@pytest.mark.parametrize("optimiser", ["muon", "adam"])
-def test_frozen_blocks_keep_the_weights_they_start_from(tmp_path, optimiser):
+def frozen_run(folder, frozen=("gru2", "head"), **choices):
+    """(settings, state, data) of a run with frozen blocks."""
     loss = Loss(l1=1.0, nlpd=0.0, haarpsi=0.0, lambda_tc=0.0, l0=0)
-    frozen = ("gru2", "head")
-    settings = tiny(tmp_path, windows=2, frozen=frozen, loss=loss, optimiser=optimiser)
+    settings = tiny(folder, windows=2, frozen=frozen, loss=loss, **choices)
     state, shape = first_state(settings), (2, 2, 16, 16)
     data = Simulation(
         jax.random.normal(jax.random.key(0), (*shape, 5)), jnp.full(shape, 0.3),
         jnp.zeros((*shape, 2)), jnp.ones(shape, bool),
     )  # fmt: skip
+    return settings, state, data
+
+
+@pytest.mark.parametrize("optimiser", ["muon", "adam"])
+def test_frozen_blocks_keep_the_weights_they_start_from(tmp_path, optimiser):
+    settings, state, data = frozen_run(tmp_path, optimiser=optimiser)
     update = jax.jit(partial(train_steps._updated, settings=settings.step_settings, warm=False))
     after, *_ = update(state._replace(step=jnp.int32(1)), data, None)
     after, *_ = update(after, data, None)  # the rate of the first step is 0
     for name, block in after.params.items():
         same = jax.tree.map(lambda a, b: bool((a == b).all()), block, state.params[name])
-        assert all(jax.tree.leaves(same)) == (name in frozen), name
+        assert all(jax.tree.leaves(same)) == (name in settings.frozen), name
+
+
+def test_blocks_beside_frozen_ones_learn_what_they_would(tmp_path):
+    settings, state, data = frozen_run(tmp_path)
 
     def gradients(settings):
         energy = partial(train_steps.loss_of, settings=settings.step_settings)
         return jax.jit(jax.grad(lambda p: energy(p, data, None, False)[0]))(state.params)
 
     ours, all_of_them = gradients(settings), gradients(replace(settings, frozen=()))
-    still = {name: jax.tree.map(jnp.zeros_like, ours[name]) for name in frozen}
-    expected = all_of_them | still  # the others learn what they would
+    still = {name: jax.tree.map(jnp.zeros_like, ours[name]) for name in settings.frozen}
+    expected = all_of_them | still
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6), ours, expected)
 
 
