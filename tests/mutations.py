@@ -29,7 +29,7 @@ MODULES = {  # what is changed: the tests that must find it
     "tensors.py": ["tensors"],
     "network.py": ["network", "arrays"],
     "convolution.py": ["convolution"],
-    "reconstruction.py": ["reconstruction", "colour"],
+    "reconstruction.py": ["reconstruction", "colour", "instants"],
     "pictures.py": ["pictures"],
     "checkpoint.py": ["checkpoint"],
     "training/losses.py": ["losses"],
@@ -128,7 +128,17 @@ def tested(folder: Path, module: str, limit: float) -> tuple[bool, float, str]:
     """(whether the module's tests pass in this copy, seconds, what they print)"""
     tests = [f"tests/test_{name}.py" for name in MODULES[module]]
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-q",
+        "--slow",
+        "-p",
+        "no:cacheprovider",
+        *tests,
+    ]
     begun = time.monotonic()
     try:
         done = subprocess.run(

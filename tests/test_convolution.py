@@ -33,7 +33,7 @@ def random_case(shape, seed=0, width=9):
     return image, rng.normal(size=shape).astype(np.float32)
 
 
-SHAPES = [(3, 3, 5, 16), (1, 1, 16, 1), (3, 5, 4, 2)]
+SHAPES = [(3, 3, 5, 16), (1, 1, 16, 1), (3, 5, 4, 2), (5, 3, 2, 3)]
 
 
 @pytest.mark.parametrize("shape", SHAPES)

@@ -5,7 +5,8 @@ import jax
 import numpy as np
 import pytest
 
-from firenet_jax.simulation.curricula import random_setups, sequences
+from firenet_jax.errors import SettingsError
+from firenet_jax.simulation.curricula import check_rare, random_setups, sequences
 from firenet_jax.simulation.scenes import SceneSettings
 from firenet_jax.simulation.sensor import FAULTY, simulate
 from firenet_jax.simulation.textures import load_textures
@@ -74,6 +75,13 @@ def test_rare_sequences_are_slow_and_calm_or_swift_before_a_blank_ground(texture
         assert (0.02 < spread).all() and (spread < 0.04).all()
     with pytest.raises(ValueError, match="together less than 1"):
         made(slow=0.6, swift=0.4)
+
+
+@pytest.mark.parametrize("shares", [(-0.1, 0.5), (0.5, -0.1), (0.6, 0.4), (0.7, 0.8)])
+def test_shares_of_rare_sequences_leave_some_for_the_usual_ones(shares):
+    check_rare(0.6, 0.3)
+    with pytest.raises(SettingsError, match="together less than 1"):
+        check_rare(*shares)
 
 
 @pytest.mark.slow

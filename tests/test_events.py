@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from firenet_jax.errors import RecordingError
-from firenet_jax.events import Events, checked
+from firenet_jax.events import Events, checked, rate_in_words
 
 
 @pytest.mark.parametrize("p", [[-1, 1], [0, 1], [False, True]])
@@ -19,6 +19,18 @@ def test_seconds_are_no_times():
     with pytest.raises(ValueError, match="whole microseconds: round 1e6 times seconds"):
         Events.of([0.25, 0.75], [0, 0], [0, 0], [0, 1])
     assert len(Events.of([], [], [], [])) == 0
+
+
+def test_backwards_is_the_other_way_round():
+    events = Events.of([5, 7, 12], [1, 2, 3], [4, 5, 6], [0, 0, 1])
+    found = events.backwards()
+    assert found.t.tolist() == [5, 10, 12]
+    assert (found.x.tolist(), found.y.tolist()) == ([3, 2, 1], [6, 5, 4])
+    assert found.p.tolist() == [False, True, True]
+
+
+def test_a_thousand_events_a_second_are_a_kev():
+    assert [rate_in_words(rate) for rate in (999, 1e3, 1e6)] == ["999 ev/s", "1 kev/s", "1 Mev/s"]
 
 
 def passed(chunks, strict=True, width=24):

@@ -332,7 +332,7 @@ def test_seconds_are_no_times(weights, recording, caplog):
 
 def test_a_grid_can_be_used_again_and_one_that_begins_too_late_is_told(weights, recording, caplog):
     times = grid(FIRST, 1000)
-    found = [list(images_at(weights, recording, times, chunk=4, events=90)) for _ in range(2)]
+    found = [list(images_at(weights, recording, times, chunk=n, events=90)) for n in (4, 1)]
     np.testing.assert_array_equal(*(np.concatenate([t for t, _ in each]) for each in found))
     assert found[0] and not caplog.text
     assert not list(images_at(weights, recording, grid(2 * FIRST, 1000), chunk=4, events=90))

@@ -13,6 +13,7 @@ import pytest
 import references
 
 from firenet_jax import tensors
+from firenet_jax.errors import SettingsError
 from firenet_jax.events import Events
 from firenet_jax.tensors import (
     BLOCK,
@@ -136,6 +137,17 @@ def test_normalise_at_sensor_size_in_float32():
 def test_gradients_are_finite_through_an_empty_window():
     gradient = jax.grad(lambda x: (normalise(x) ** 2).sum())(jnp.zeros((4, 5, 5)))
     assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("width, many", [(20_724, False), (20_725, True)])
+def test_places_that_32_bits_do_not_count_are_refused(width, many):
+    packed = pack([[random_events(np.random.default_rng(0), 10)]])
+    function = partial(voxelise, height=20_724, width=width)
+    if many:
+        with pytest.raises(SettingsError, match="too many for one chunk"):
+            jax.eval_shape(function, packed)
+    else:
+        assert jax.eval_shape(function, packed).shape == (1, 1, 20_724, width, 5)
 
 
 def test_float32_where_a_program_has_long_floats():

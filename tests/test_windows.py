@@ -156,6 +156,16 @@ def test_frames_on_another_clock_are_refused(frames, events):
         list(cut(recording, Windows(frame_to_frame=True)))
 
 
+def test_frames_that_last_for_hours_are_on_the_clock_of_events_after_them():
+    recording = recording_of([5_000_000_005, 5_000_000_009], frames=[0, 5_000_000_000])
+    assert sum(len(window.events) for window in cut(recording, Windows(frame_to_frame=True))) == 2
+
+
+def test_equal_choices_are_one_choice():
+    """So that they can be arguments of a compiled function."""
+    assert len({Windows(events=5), Windows(events=5), Windows(events=6)}) == 2
+
+
 @pytest.mark.parametrize("after, refused", [(3_600_000_000, False), (3_600_000_001, True)])
 def test_an_hour_is_not_another_clock(after, refused):
     found = cut(recording_of([0, 5], frames=[after, 2 * after]), Windows(frame_to_frame=True))
@@ -259,7 +269,9 @@ def test_windows_of_at_most_so_many_events_and_so_long():
         assert [window.time for window in found] == [t[i - 1] for i in (*expected[1:], 3000)]
 
 
-@pytest.mark.parametrize("seconds, longest", [(0.0, 0.001), (0.1, 5.0), (0.8, 40.0), (60.0, 40.0)])
+@pytest.mark.parametrize(
+    "seconds, longest", [(0.0, 0.001), (0.1, 5.0), (0.8, 40.0), (0.8005, 40.0), (60.0, 40.0)]
+)
 def test_what_is_usual_depends_on_how_long_a_recording_is(seconds, longest):
     t = np.linspace(0, seconds * 1e6, 50).astype(np.int64)
     zeros = np.zeros(50, np.int16)
