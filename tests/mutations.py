@@ -39,6 +39,18 @@ MODULES = {  # what is changed: the tests that must find it
 }
 EQUIVALENT = {  # (module, line after the change): why nothing changes
     (
+        "tensors.py",
+        "windows: Sequence[Sequence[Events]], devices: int, at_least: int = 1",
+    ): "the smallest size is larger",
+    (
+        "simulation/curricula.py",
+        "sensors = _uneven(sensors, numbers[2], is_slow, slow)",
+    ): "JAX takes the last row for one beyond it",
+    (
+        "simulation/sensor.py",
+        "spacing = jnp.where(count >= 1, stride, 0.0).astype(jnp.int32) * run.spacing",
+    ): "a run of one event has no second one",
+    (
         "windows.py",
         "def _window(events: Events, start: int, stop: int, end: int = 1) -> Window:",
     ): "who leaves `end` out has events, whose last time is taken",

@@ -59,6 +59,7 @@ def test_rare_sequences_are_slow_and_calm_or_swift_before_a_blank_ground(texture
     slow, swift = pixels < 0.31, pixels > 15.9
     assert 0.15 < slow.mean() < 0.45 and 0.08 < swift.mean() < 0.32
     assert pixels.min() > 0.019 and pixels.max() < 90.1
+    assert pixels[slow].max() > 0.2 and pixels[swift].max() > 60
     usual = pixels[~slow & ~swift]
     assert usual.max() < 2.51  # or less: a window lasts 300 ms at most
     blank = np.ptp(np.asarray(scenes.textures[0]).reshape(96, -1), axis=1) == 0

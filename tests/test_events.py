@@ -1,3 +1,4 @@
+from dataclasses import FrozenInstanceError
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,16 @@ def many(first, count=2000, then=()):
     """Right events, one a microsecond, and then some at these times."""
     t = [*range(first, first + count), *then]
     return Events.of(t, np.ones(len(t)), np.ones(len(t)), np.ones(len(t)))
+
+
+def test_a_place_outside_is_named_where_two_events_have_one_time():
+    with pytest.raises(RecordingError, match="x is 24"):
+        passed([many(0, 3), row(2, x=24)])
+
+
+def test_events_do_not_change():
+    with pytest.raises(FrozenInstanceError):
+        row(1).t = np.zeros(1)
 
 
 def test_events_that_are_right_pass_as_they_are():

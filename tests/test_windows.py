@@ -161,6 +161,10 @@ def test_frames_that_last_for_hours_are_on_the_clock_of_events_after_them():
     assert sum(len(window.events) for window in cut(recording, Windows(frame_to_frame=True))) == 2
 
 
+def test_a_step_may_be_as_short_as_a_clock_tick():
+    assert Windows(duration=0.005, step=0.001).step == 0.001
+
+
 def test_equal_choices_are_one_choice():
     """So that they can be arguments of a compiled function."""
     assert len({Windows(events=5), Windows(events=5), Windows(events=6)}) == 2
