@@ -89,25 +89,18 @@ def unsharp_kernel(amount: float) -> np.ndarray:
 
 def unsharp_mask(images: jax.Array, amount: float) -> jax.Array:
     """(..., H, W) -> (1 + amount) image - amount blurred image; 5x5 kernel, zero padding."""
-    return (1 + amount) * images - amount * blurred(images, _unsharp_weights(), "constant")
-
-
-def blurred(images: jax.Array, weights: jax.Array | np.ndarray, border: str) -> jax.Array:
-    """(..., H, W), an odd number of weights -> the sums of neighbours down and across, weighted.
-
-    border: a mode of jnp.pad.
-    """
-    reach = len(weights) // 2
+    blurred = images
     for axis in (-2, -1):
-        sides = [(0, 0)] * images.ndim
-        sides[axis] = reach, reach
-        size, padded = images.shape[axis], jnp.pad(images, sides, mode=border)
+        size = blurred.shape[axis]
+        padding = [(0, 0)] * blurred.ndim
+        padding[axis] = (2, 2)
+        padded = jnp.pad(blurred, padding)
         shifted = (
-            weight * jax.lax.slice_in_dim(padded, k, k + size, axis=axis)
-            for k, weight in enumerate(weights)
+            float(weight) * jax.lax.slice_in_dim(padded, k, k + size, axis=axis)
+            for k, weight in enumerate(_unsharp_weights())
         )
-        images = sum(shifted, jnp.zeros_like(images))
-    return images
+        blurred = sum(shifted, jnp.zeros_like(images))
+    return (1 + amount) * images - amount * blurred
 
 
 @partial(jax.jit, static_argnames="settings")

@@ -31,7 +31,7 @@ from firenet_jax.pictures import (
     event_pictures,
     initial_display_state,
 )
-from firenet_jax.tensors import PACKED_SPECS, Packed, in_groups, normalise, voxelise
+from firenet_jax.tensors import PACKED_SPECS, Packed, normalise, tensor_chunks, voxelise
 from firenet_jax.windows import Windows, cut, usual
 
 
@@ -310,7 +310,7 @@ def images_at(
     counts = Counts()
     times = copy.copy(times) if isinstance(times, Grid) else times  # a grid counts on
     entries = itertools.chain(first, steps(recording, chosen, times, cutter, counts))
-    for group, tensors in in_groups(recording, entries, chunk):
+    for group, tensors in tensor_chunks(recording, entries, chunk):
         looks, valid = looks_of([group], chunk), np.arange(chunk)[:, None] < len(group)
         committed, images = reconstruct_at(weights, committed, tensors, looks, valid)
         seen = np.flatnonzero(looks.looks[:, 0])

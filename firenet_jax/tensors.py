@@ -250,11 +250,11 @@ def event_tensors(
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but must be 1 or more windows")
     check_recording(recording)
-    for group, tensors in in_groups(recording, cut(recording, Windows(**windows)), chunk):
+    for group, tensors in tensor_chunks(recording, cut(recording, Windows(**windows)), chunk):
         yield tensors[: len(group)], np.array([window.time for window in group], np.int64)
 
 
-def in_groups(
+def tensor_chunks(
     recording: Recording, items: Iterator[Item], chunk: int
 ) -> Iterator[tuple[list[Item], jax.Array]]:
     """Windows or steps of a recording -> lists of `chunk` of them, the last one shorter, with

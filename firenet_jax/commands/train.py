@@ -34,7 +34,7 @@ from firenet_jax.reconstruction import reconstruct
 from firenet_jax.storage import runs
 from firenet_jax.storage.files import identity, write_text
 from firenet_jax.storage.sequence_file import Picture, write_sequence
-from firenet_jax.tensors import in_groups
+from firenet_jax.tensors import tensor_chunks
 from firenet_jax.training import run as training
 from firenet_jax.training.settings import Train
 from firenet_jax.training.step import near_events
@@ -260,7 +260,7 @@ def judged(weights: Weights, one: Cut, near: bool) -> Score:
     windows = itertools.islice(windows, len(times) - first - 1)
     state = initial_state(1, one.recording.height, one.recording.width)
     seen, scores, number = jnp.zeros((1, *state.g1.shape[:3]), bool), [], first + 1
-    for group, tensors in in_groups(one.recording, windows, WINDOWS_AT_ONCE):
+    for group, tensors in tensor_chunks(one.recording, windows, WINDOWS_AT_ONCE):
         state, images = reconstruct(weights, state, tensors)
         near_now = near_events(tensors) | seen
         seen = near_now[-1:]

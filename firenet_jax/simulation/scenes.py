@@ -23,7 +23,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.errors import SettingsError
-from firenet_jax.pictures import blurred
 from firenet_jax.settings import check_range
 from firenet_jax.warp import sample
 
@@ -335,7 +334,16 @@ def _blurred(image: jax.Array, sigma: jax.Array) -> jax.Array:
     """(S, S) -> the same under a Gaussian of this many pixels, mirrored at the border."""
     distance = jnp.arange(-BLUR, BLUR + 1, dtype=jnp.float32)
     weights = jnp.exp(-0.5 * (distance / sigma) ** 2)
-    return blurred(image, weights / weights.sum(), "reflect")
+    weights = weights / weights.sum()
+    for axis in (0, 1):
+        padded = jnp.pad(image, [(BLUR * (a == axis),) * 2 for a in (0, 1)], mode="reflect")
+        size = image.shape[axis]
+        shifted = (
+            weights[k] * jax.lax.slice_in_dim(padded, k, k + size, axis=axis)
+            for k in range(2 * BLUR + 1)
+        )
+        image = sum(shifted, jnp.zeros_like(image))
+    return image
 
 
 def _outline(key: jax.Array) -> jax.Array:
