@@ -461,6 +461,11 @@ def _call(function, args):
 
 
 _CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
+# Instructions whose argument is a value: texts, numbers, bytes, and those of Python 2.
+_VALUES = set(
+    "BINUNICODE SHORT_BINUNICODE BINUNICODE8 UNICODE BININT BININT1 BININT2 LONG1 LONG4 INT LONG "
+    "BINFLOAT FLOAT BINBYTES SHORT_BINBYTES BINBYTES8 STRING BINSTRING SHORT_BINSTRING".split()
+)
 
 
 def _unpickle(stream: io.BytesIO, storages: dict[str, _Storage]):
@@ -491,16 +496,10 @@ def _unpickle(stream: io.BytesIO, storages: dict[str, _Storage]):
         if number == MAX_INSTRUCTIONS:
             raise ValueError(f"a pickle of more than {MAX_INSTRUCTIONS} instructions")
         match opcode.name:
-            case "BINUNICODE" | "SHORT_BINUNICODE" | "BINUNICODE8" | "UNICODE":
+            case name if name in _VALUES:
                 stack.append(arg)
-            case "BININT" | "BININT1" | "BININT2" | "LONG1" | "LONG4" | "INT" | "LONG":
-                stack.append(arg)
-            case "BINFLOAT" | "FLOAT" | "BINBYTES" | "SHORT_BINBYTES" | "BINBYTES8":
-                stack.append(arg)
-            case "STRING" | "BINSTRING" | "SHORT_BINSTRING":  # Python 2
-                stack.append(arg)
-            case "NONE" | "NEWTRUE" | "NEWFALSE" | "EMPTY_TUPLE":
-                stack.append(_CONSTANTS[opcode.name])
+            case name if name in _CONSTANTS:
+                stack.append(_CONSTANTS[name])
             case "EMPTY_DICT":
                 stack.append({})
             case "EMPTY_LIST":
@@ -522,17 +521,11 @@ def _unpickle(stream: io.BytesIO, storages: dict[str, _Storage]):
             case "FROZENSET":
                 since_mark()
                 stack.append(_Inert())
-            case "APPEND":
-                items = last(1)
+            case "APPEND" | "APPENDS" | "ADDITEMS":
+                items = last(1) if opcode.name == "APPEND" else since_mark()
                 _extend(stack[-1], items)
-            case "APPENDS" | "ADDITEMS":
-                items = since_mark()
-                _extend(stack[-1], items)
-            case "SETITEM":
-                items = last(2)
-                _put(stack[-1], items)
-            case "SETITEMS":
-                items = since_mark()
+            case "SETITEM" | "SETITEMS":
+                items = last(2) if opcode.name == "SETITEM" else since_mark()
                 _put(stack[-1], items)
             case "PUT" | "BINPUT" | "LONG_BINPUT":
                 memo[arg] = stack[-1]
@@ -540,7 +533,7 @@ def _unpickle(stream: io.BytesIO, storages: dict[str, _Storage]):
                 memo[len(memo)] = stack[-1]
             case "GET" | "BINGET" | "LONG_BINGET":
                 stack.append(memo[arg])
-            case "POP":
+            case "POP" | "BUILD":
                 last(1)
             case "POP_MARK":
                 since_mark()
@@ -553,8 +546,6 @@ def _unpickle(stream: io.BytesIO, storages: dict[str, _Storage]):
             case "NEWOBJ_EX":
                 function, args, _keywords = last(3)
                 stack.append(_call(function, args))
-            case "BUILD":
-                last(1)
             case "BINPERSID":
                 stack.append(_storage(storages, *last(1)))
             case "PROTO" | "FRAME":
