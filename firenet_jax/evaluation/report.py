@@ -10,6 +10,7 @@ import base64
 import csv
 import datetime
 import io
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from html import escape
@@ -197,15 +198,10 @@ def page(results: dict, shown: dict[str, Shown]) -> str:
         f"<p>{escape(made(results))}</p>",
         f"<p><code>{escape(results.get('command', ''))}</code></p>",
     ]
-    for kind, title in (
-        ("over sequences", "Mean over sequences"),
-        ("over frames", "Mean over frames"),
-    ):
-        if len(sequences) == 1:  # the mean of one says the same again
-            continue
-        parts.append(
-            f"<div class=wide>{_table(results, results['means'][kind], colours, title)}</div>"
-        )
+    if len(sequences) != 1:  # the mean of one says the same again
+        for kind, means in results["means"].items():
+            table_of = _table(results, means, colours, f"Mean {kind}")
+            parts.append(f"<div class=wide>{table_of}</div>")
     said = [*(f"{name}: {about(name)}" for name in results["methods"]), *notes(results)]
     parts.append("<ul>" + "".join(f"<li>{escape(note)}</li>" for note in said) + "</ul>")
     links = (f'<a href="#{_anchor(k)}">{escape(name)}</a>' for k, name in enumerate(sequences))
@@ -253,17 +249,12 @@ def _described(facts: dict) -> str:
     if facts["sensor"] is None:
         return "not opened"
     width, height = facts["sensor"]
-    return (
-        f"{facts['format']}, {width}x{height}; counted: {_interval(facts)}; "
-        f"{facts['images'] or 'no images'}"
-    )
-
-
-def _interval(facts: dict) -> str:
     start, stop = facts["counted_seconds"]
-    if stop is None:
-        return "all frames" if not start else f"frames from {start:g} s on"
-    return f"frames from {start:g} to {stop:g} s"
+    counted = f"frames from {start:g} s on" if start else "all frames"
+    if stop is not None:
+        counted = f"frames from {start:g} to {stop:g} s"
+    images = facts["images"] or "no images"
+    return f"{facts['format']}, {width}x{height}; counted: {counted}; {images}"
 
 
 def _table(results: dict, entries: dict[str, dict], colours: dict[str, str], title: str) -> str:
@@ -386,15 +377,10 @@ def chart(title: str, series: dict[str, tuple[Sequence, Sequence]], colours: dic
 
 def _runs(times: Sequence, values: Sequence) -> Iterator[list[tuple[float, float]]]:
     """Stretches without None."""
-    run = []
-    for t, v in zip(times, values, strict=True):
-        if v is not None:
-            run.append((t, v))
-        elif run:
-            yield run
-            run = []
-    if run:
-        yield run
+    points = zip(times, values, strict=True)
+    for there, run in itertools.groupby(points, lambda point: point[1] is not None):
+        if there:
+            yield list(run)
 
 
 def steps(low: float, high: float) -> list[float]:
