@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.errors import SettingsError
-from firenet_jax.evaluation.metrics import root
+from firenet_jax.evaluation.metrics import exactly_convolved, root
 from firenet_jax.storage.pytorch_file import identify, read_state_dict, take
 
 MIN_SIDE = 31  # pixels of a side: AlexNet's last pool then makes one of them
@@ -105,16 +105,9 @@ def _squeezenet(convolutions: dict, x: jax.Array) -> list[jax.Array]:
 
 
 def _convolve(layer: tuple, x: jax.Array, stride: int = 1, padding: int = 0) -> jax.Array:
-    """Convolution, bias, ReLU; in whole float32 also where the default is shorter (TF32)."""
+    """Convolution, bias, ReLU."""
     kernel, bias = layer
-    x = jax.lax.conv_general_dilated(
-        x,
-        kernel,
-        (stride, stride),
-        [(padding, padding)] * 2,
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        precision="highest",
-    )
+    x = exactly_convolved(x, kernel, (stride, stride), [(padding, padding)] * 2)
     return jax.nn.relu(x + bias.reshape(1, 1, 1, -1))
 
 

@@ -26,10 +26,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from firenet_jax.convolution import DIMENSIONS
 from firenet_jax.errors import SettingsError
 from firenet_jax.warp import warp
 
 Border = Literal["valid", "symmetric", "constant", "edge"]
+
+# image, kernel, strides, padding -> image; in full float32 even if the default is less (TF32)
+exactly_convolved = partial(
+    jax.lax.conv_general_dilated, dimension_numbers=DIMENSIONS, precision="highest"
+)
 
 
 def _matrix(size: int, weights, border: Border = "valid", stride: int = 1) -> np.ndarray:
@@ -500,15 +506,7 @@ def _random_layers(kernels: list[np.ndarray], image: jax.Array) -> list[jax.Arra
     for layer, kernel in enumerate(kernels):
         if layer:
             x = _blocks(x).mean(3)
-        x = jax.lax.conv_general_dilated(
-            x,
-            jnp.asarray(kernel),
-            window_strides=(1, 1),
-            padding="SAME",
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-            precision="highest",
-        )
-        x = jax.nn.relu(x)
+        x = jax.nn.relu(exactly_convolved(x, jnp.asarray(kernel), (1, 1), "SAME"))
         # 1e-4, small against a usual norm of 1: features of empty areas stay near zero.
         unit = x / jnp.sqrt((x**2).sum(-1, keepdims=True) + 1e-4)
         layers.append(unit.reshape(*leading, *unit.shape[1:]))
