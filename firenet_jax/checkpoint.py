@@ -83,8 +83,10 @@ def load_weights(path: str | Path | None = None) -> Weights:
     None or "built-in": the weights in the package.
     Raises CheckpointError for a file that is missing, damaged or of another network.
     """
-    if path is None or str(path) == BUILT_IN:
-        return _load_default()
+    if path is None or str(path) == BUILT_IN:  # docs/model_card.md says how they were trained
+        file = importlib.resources.files("firenet_jax") / "weights" / "firenet.npz"
+        with importlib.resources.as_file(file) as built_in:
+            return _load_npz(built_in)
     path = Path(path)
     if path.is_dir():
         path = path / "weights.npz"  # a training run keeps its best weights here
@@ -96,13 +98,6 @@ def load_weights(path: str | Path | None = None) -> Weights:
     if path.suffix == ".npz":
         return _load_npz(path)
     raise CheckpointError(f"{path} has an unknown ending {path.suffix!r}; {TRY}")
-
-
-def _load_default() -> Weights:
-    """The weights in the package; docs/model_card.md says how they were trained."""
-    file = importlib.resources.files("firenet_jax") / "weights" / "firenet.npz"
-    with importlib.resources.as_file(file) as path:
-        return _load_npz(path)
 
 
 def _load_npz(path: Path) -> Weights:

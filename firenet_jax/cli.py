@@ -29,13 +29,8 @@ COMMANDS = {
 }
 
 # Libraries that only some commands need -> the extra of this package that installs them.
-EXTRAS = {
-    "optax": "train",
-    "orbax": "train",
-    "grain": "train",
-    "tensorboardX": "train",
-    "skimage": "evaluate",
-}
+EXTRAS: dict[str, str] = dict.fromkeys(("optax", "orbax", "grain", "tensorboardX"), "train")
+EXTRAS |= {"skimage": "evaluate"}
 
 # Options of the original program (rpg_e2vid) -> the equivalent here.
 FORMER = {
@@ -57,16 +52,12 @@ FORMER = {
 
 
 def usage() -> str:
-    lines = [f"  firenet {name:13} {summary}" for name, summary in COMMANDS.items()]
-    return "\n".join(
-        [
-            "firenet_jax: event camera recordings become video (FireNet in JAX)",
-            "",
-            *lines,
-            "",
-            "firenet COMMAND --help explains a command and gives examples. With FIRENET_DEBUG=1",
-            "in the environment, errors show a traceback. firenet --version prints the version.",
-        ]
+    commands = "\n".join(f"  firenet {name:13} {said}" for name, said in COMMANDS.items())
+    return (
+        "firenet_jax: event camera recordings become video (FireNet in JAX)\n\n"
+        f"{commands}\n\n"
+        "firenet COMMAND --help explains a command and gives examples. With FIRENET_DEBUG=1\n"
+        "in the environment, errors show a traceback. firenet --version prints the version."
     )
 
 

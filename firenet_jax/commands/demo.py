@@ -182,21 +182,15 @@ def _show(simulated, images, last, ranges: DisplayState):
     tensors, truth, displacement, visible = (leaf[:, 0] for leaf in simulated)
     ranges, greys = display(ranges, images[:, None])
     clipped = jnp.clip(images, 0.0, 1.0)
-    before = (
+    previous, previous_truth = (
         jnp.concatenate([one[None], all[:-1]])
         for one, all in zip(last, (clipped, truth), strict=True)
     )
-    previous, previous_truth = before
-    errors = jnp.stack(
-        [
-            mse(clipped, truth),
-            ssim(clipped, truth),
-            temporal_error(clipped, previous, displacement, truth, previous_truth, visible),
-        ],
-        -1,
-    )
+    errors = [mse(clipped, truth), ssim(clipped, truth)]
+    errors.append(temporal_error(clipped, previous, displacement, truth, previous_truth, visible))
+    numbers = jnp.stack(errors, -1)
     eight_bit = jnp.round(jnp.clip(255 * truth, 0, 255)).astype(jnp.uint8)
-    shown = Shown(event_pictures(tensors), greys[:, 0], eight_bit, errors)
+    shown = Shown(event_pictures(tensors), greys[:, 0], eight_bit, numbers)
     return (clipped[-1], truth[-1]), ranges, shown
 
 

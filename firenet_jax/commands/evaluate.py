@@ -10,7 +10,7 @@ Results appear under their names when they are complete, so an interrupted run r
 others. A metric that cannot be computed is null, with a reason, never NaN.
 """
 
-import dataclasses
+import functools
 import hashlib
 import importlib
 import importlib.metadata
@@ -155,7 +155,7 @@ def run(settings: Evaluate) -> dict:
     recordings = {name: one for name, one in sequences.items() if isinstance(one, Recording)}
     shared = describe(settings, learned)
     records = {
-        (name, method.name): describe_one(shared, recording, method)
+        (name, method.name): shared | {"recording": identity(recording.path), **method.record}
         for name, recording in recordings.items()
         for method in methods
         if isinstance(method, Method)
@@ -295,18 +295,10 @@ def describe(settings: Evaluate, learned: lpips.Lpips | None) -> dict:
 
 def asked(times: Times) -> dict:
     """What is not at its default; of a file of times what it holds, not its name."""
-    found = {
-        field.name: getattr(times, field.name)
-        for field in dataclasses.fields(times)
-        if getattr(times, field.name) != field.default
-    }
+    found = {name: value for name, value in vars(times).items() if value != getattr(Times, name)}
     if times.at is not None:
         found["at"] = hashlib.sha256(repr(read_times(times.at)).encode()).hexdigest()[:16]
     return found
-
-
-def describe_one(shared: dict, recording: Recording, method: Method) -> dict:
-    return shared | {"recording": identity(recording.path), **method.record}
 
 
 def result_file(settings: Evaluate, sequence: str, method: str) -> Path:
@@ -370,8 +362,7 @@ def summarise(settings, shared, plans, found, methods, done, gaps) -> dict:
         entries = {}
         for method in methods:
             key = name, method.name
-            result = done.get(key)
-            entries[method.name] = {"gap": gaps[key]} if result is None else summary(result)
+            entries[method.name] = summary(done[key]) if key in done else {"gap": gaps[key]}
         start, stop = settings.protocol.interval(sequence.path)
         sequences[name] = {
             "path": str(sequence.path),
@@ -421,13 +412,11 @@ def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
     events = events_before(
         plan, settings, {number for f in kept.values() for n in names for number in f[n].tolist()}
     )
-    truths: dict[int, np.ndarray] = {}
 
+    @functools.cache
     def truth(number: int) -> np.ndarray:
-        if number not in truths:
-            frame = plan.frames.read(number).astype(np.float32) / 255
-            truths[number] = to_8_bit(equalise(frame, settings.equalise))
-        return truths[number]
+        frame = plan.frames.read(number).astype(np.float32) / 255
+        return to_8_bit(equalise(frame, settings.equalise))
 
     def side_by_side(kind: str) -> Iterator[tuple[int, list[np.ndarray]]]:
         """Frames that every method has: (number, [events, frame, method, method ...])."""

@@ -81,13 +81,12 @@ def _plain(hint: Any, text: str, required: bool) -> Any:
     parts = typing.get_args(kind) if typing.get_origin(kind) is tuple else (kind,)
     if all(part in METAVARS for part in parts):
         said["metavar"] = " ".join(METAVARS[part] for part in parts).replace(" ...", "...")
-    if set(parts) <= {int, float}:
-        return Annotated[Any, tyro.conf.arg(**said), _read_as(said["metavar"], parts), *extras]
     if typing.get_origin(kind) is typing.Literal:
-        choices = typing.get_args(kind)
-        said["metavar"] = f"{{{','.join(choices)}}}"
-        return Annotated[Any, tyro.conf.arg(**said), _read_as(said["metavar"], choices), *extras]
-    return Annotated[whole, tyro.conf.arg(**said), *extras]
+        parts = typing.get_args(kind)
+        said["metavar"] = f"{{{','.join(parts)}}}"
+    elif not set(parts) <= {int, float}:
+        return Annotated[whole, tyro.conf.arg(**said), *extras]
+    return Annotated[Any, tyro.conf.arg(**said), _read_as(said["metavar"], parts), *extras]
 
 
 def _read_as(metavar: str, parts: tuple) -> tyro.constructors.PrimitiveConstructorSpec:

@@ -207,22 +207,17 @@ def do_all(jobs: list[Job], settings: Reconstruct, weights: Weights, outcome: Ou
         several=len(settings.recordings) > 1,
         overwrite=settings.overwrite,
     )
+    groups: dict[tuple[int, int], list[Job]] = {}  # of one size, as these can share a batch
+    for job in jobs:
+        groups.setdefault((job.recording.height, job.recording.width), []).append(job)
     counts = [job.recording.count for job in jobs if job.recording.count is not None]
     partly = settings.start or settings.stop or settings.windows.step
     known = None if len(counts) < len(jobs) or partly else sum(counts)
     read = Bytes([job.recording.path for job in jobs] if known is None else [])
     unit = "ev" if known or read.total is None else "B"
     with bar(known or read.total, unit, unit_scale=True, smoothing=0.1) as progress:
-        for same in by_sensor_size(jobs):
+        for same in groups.values():
             do_jobs(same, way, weights, outcome, progress, read, settings.show)
-
-
-def by_sensor_size(jobs: list[Job]) -> list[list[Job]]:
-    """Groups the jobs, as only recordings of the same size can share a batch."""
-    groups: dict[tuple[int, int], list[Job]] = {}
-    for job in jobs:
-        groups.setdefault((job.recording.height, job.recording.width), []).append(job)
-    return list(groups.values())
 
 
 # ---- The jobs
@@ -391,13 +386,10 @@ def closing_line(done: list[Done], seconds: float, times: Times) -> str:
         ways = {"windows as they suit each recording"}
     if times.wanted:
         ways = {f"{times.in_words()}, the state by {way}" for way in ways}
-    factors = [one.slower for one in done if one.slower is not None]
-    plays = ""
-    if factors:
-        least, most = min(factors), max(factors)
-        plays = f"; plays {factor_in_words(least)}"
-        if factor_in_words(most) != factor_in_words(least):
-            plays += f" to {factor_in_words(most)}"
+    factors = sorted(one.slower for one in done if one.slower is not None)
+    # of the least and the greatest, which may read the same
+    said = dict.fromkeys(factor_in_words(slower) for slower in (*factors[:1], *factors[-1:]))
+    plays = f"; plays {' to '.join(said)}" if said else ""
     rates = f"{pictures / seconds:.1f} pictures/s, {rate_in_words(events / seconds)}"
     return (
         f"{', '.join(str(one.job.output) for one in done)}: {counted(pictures, 'picture')} of "

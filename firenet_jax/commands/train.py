@@ -99,7 +99,13 @@ def cut_off(path: Path, windows: int) -> Cut:
             f"{path}: holds no frames to learn from: use a recording of a camera that takes "
             "pictures beside the events, or a folder of HDF5 sequences"
         )
-    _check_times(path, frames.times)
+    later = np.diff(frames.times) > 0
+    if not later.all():
+        frame = int(np.argmin(later)) + 1
+        raise RecordingError(
+            f"{path}, frame {frame + 1}: its time is {frames.times[frame]} us, not after "
+            f"{frames.times[frame - 1]} us, that of the frame before: the file is damaged"
+        )
     count = len(frames.times) - 1
     held = max(count // HELD_OUT_SHARE, windows)
     if count - held < windows + 1:  # a start is drawn from one place or more
@@ -116,15 +122,6 @@ def cut_off(path: Path, windows: int) -> Cut:
     found = Cut(recording, frames, count - held)
     found.frame(0)  # of another size than the sensor, most often all are
     return found
-
-
-def _check_times(path: Path, times: np.ndarray) -> None:
-    if not (np.diff(times) > 0).all():
-        frame = int(np.argmin(np.diff(times) > 0)) + 1
-        raise RecordingError(
-            f"{path}, frame {frame + 1}: its time is {times[frame]} us, not after "
-            f"{times[frame - 1]} us, that of the frame before: the file is damaged"
-        )
 
 
 def check_fit(cuts: list[Cut], settings: Train) -> None:
