@@ -45,15 +45,10 @@ class _Graph:
 
     def convolve(self, image: str, layer: dict, out: str) -> str:
         kernel = np.asarray(layer["kernel"], np.float32).transpose(3, 2, 0, 1)  # HWIO -> OIHW
-        return self.add(
-            "Conv",
-            image,
-            self.constant(f"{out}.weight", kernel),
-            self.constant(f"{out}.bias", np.asarray(layer["bias"], np.float32)),
-            out=out,
-            kernel_shape=kernel.shape[2:],
-            pads=[kernel.shape[2] // 2] * 4,
-        )
+        weight = self.constant(f"{out}.weight", kernel)
+        bias = self.constant(f"{out}.bias", np.asarray(layer["bias"], np.float32))
+        size, pads = kernel.shape[2:], [kernel.shape[2] // 2] * 4
+        return self.add("Conv", image, weight, bias, out=out, kernel_shape=size, pads=pads)
 
 
 def onnx_model(weights: Weights, *, normalise: bool = True, picture: bool = False):

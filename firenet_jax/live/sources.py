@@ -133,20 +133,17 @@ def tcp(host: str, port: int) -> Iterator[bytes]:
 def standard_input() -> Iterator[bytes]:
     """What is piped into this program, until its end."""
     pipe = cast(io.BufferedReader, sys.stdin.buffer)
-    if not hasattr(select, "poll"):  # Windows: pipes cannot be asked, so this may wait
-        while piece := pipe.read1(PIECE):
-            yield piece
-        return
-    poll = select.poll()
-    poll.register(pipe.fileno(), select.POLLIN)
+    poll = None
+    if hasattr(select, "poll"):  # not on Windows: pipes cannot be asked there, so this may wait
+        poll = select.poll()
+        poll.register(pipe.fileno(), select.POLLIN)
     while True:
-        if not poll.poll(1000 * TICK):
+        if poll is not None and not poll.poll(1000 * TICK):
             yield b""
-            continue
-        piece = pipe.read1(PIECE)
-        if not piece:
+        elif piece := pipe.read1(PIECE):
+            yield piece
+        else:
             return
-        yield piece
 
 
 def growing(path: Path) -> Iterator[bytes]:

@@ -1,14 +1,7 @@
 """What HDF5 writes -> a file, and afterwards the first write that found no room.
 
 Where the last writes of a file fail, HDF5 ends the whole process, or prints tracebacks that nobody
-can catch: so it gets a file object whose writes never fail.
-
-    with path.open("w+b", buffering=0) as opened:
-        disk = Disk(opened)
-        with h5py.File(disk, "w") as file:
-            for item in disk.during(items):
-                ...
-        disk.check()
+can catch: so it gets a file object whose writes never fail. `sequence_file` shows its use.
 """
 
 import io

@@ -4,6 +4,7 @@ Used as `for chunk in ahead(device(ahead(reader)))`. The work inside releases th
 HDF5, XLA, zlib), so the stages really run side by side.
 """
 
+import contextlib
 import queue
 import threading
 from collections.abc import Generator, Iterator
@@ -22,11 +23,9 @@ def ahead(items: Iterator, depth: int = 2) -> Generator:
 
     def put(entry) -> bool:
         while not stop.is_set():
-            try:
+            with contextlib.suppress(queue.Full):
                 ready.put(entry, timeout=0.1)
                 return True
-            except queue.Full:
-                continue
         return False
 
     def work():

@@ -40,10 +40,8 @@ class _Lines(tqdm):
 def bar(total: float | None, unit: str, quiet: bool = False, **choices) -> tqdm:
     """A bar of tqdm on a terminal, lines elsewhere. total: None where it is not known; quiet: shows
     nothing; choices: further arguments of tqdm."""
-    if quiet:
-        return tqdm(total=total, unit=unit, disable=True, **choices)
-    kind = tqdm if sys.stderr.isatty() else _Lines
-    return kind(total=total, unit=unit, **choices)
+    kind = tqdm if quiet or sys.stderr.isatty() else _Lines
+    return kind(total=total, unit=unit, disable=quiet, **choices)
 
 
 class Bytes:

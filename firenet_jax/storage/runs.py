@@ -4,14 +4,7 @@ A run is a folder that one process at a time writes into (`alone_in`), with a re
 in it, and what is done. A record holds, ready for JSON, all that the output depends on. Whoever
 finds one asks `check_same`: are these the same settings? If so it goes on with what is missing; if
 not, one sentence names each setting that differs and what to do. Files appear when they are whole
-(`files`), so what is there is done.
-
-    now = recorded(settings, but=("output", "overwrite"))
-    with alone_in(folder):
-        found = read_record(folder / "settings.json", "choose another output")
-        if found is not None:
-            check_same(found, now, f"{folder} holds other settings", "choose another output")
-        write_text(folder / "settings.json", as_text(now))
+(`files`), so what is there is done. `commands.simulate` goes through all of it.
 """
 
 import contextlib

@@ -292,10 +292,9 @@ class VideoWriter:
             odd = [(0, side % 2) for side in picture.shape[:2]]
             picture = np.pad(picture, odd + [(0, 0)] * (picture.ndim - 2), mode="edge")
         stream = self.stream or self._start(*picture.shape[:2])
+        if self.filter and picture.ndim == 2:  # the filter graph was made for colours
+            picture = np.stack([picture] * 3, -1)
         layout = "gray" if picture.ndim == 2 else "rgb24"
-        if self.filter:  # the filter graph was made for colours
-            picture = np.stack([picture] * 3, -1) if picture.ndim == 2 else picture
-            layout = "rgb24"
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=layout)
         self.first, self.last = (self.first if self.count else time), time
         self.at = self._next() if self.count else 0
