@@ -370,8 +370,7 @@ def describe(
         told["hot_pixels"] = hashlib.sha256(hot.tobytes()).hexdigest()
     if settings.output.suffix in video.VIDEOS:
         told |= {"fps": settings.fps, "speed": settings.speed}
-    in_a_bag = settings.output.suffix in (".bag", ".ros2")
-    of_bags = () if in_a_bag else ("topic", "frame_id")
+    of_bags = () if settings.output.suffix in (".bag", ".ros2") else ("topic", "frame_id")
     return recorded(settings, (*UNRECORDED, *of_bags), **told)
 
 

@@ -76,13 +76,10 @@ class BagWriter:
             )
         seconds, rest = divmod(time, 1_000_000)
         make, height, width = self.types.types, *picture.shape[:2]
-        header = {
-            "stamp": make[TIME](sec=seconds, nanosec=1000 * rest), "frame_id": self.frame_id
-        }  # fmt: skip
-        if not self.ros2:
-            header["seq"] = self.count
+        stamp = make[TIME](sec=seconds, nanosec=1000 * rest)
+        number = {} if self.ros2 else {"seq": self.count}
         message = make[IMAGE](
-            header=make[HEADER](**header),
+            header=make[HEADER](stamp=stamp, frame_id=self.frame_id, **number),
             height=height,
             width=width,
             encoding="mono8" if picture.ndim == 2 else "rgb8",

@@ -80,10 +80,7 @@ def initial_state(height: int, width: int) -> HighPassState:
 def step(
     state: HighPassState, window: Window, settings: HighPass = HighPass()
 ) -> tuple[HighPassState, jax.Array]:
-    """(HighPassState, Window of any size) -> (HighPassState, (H, W) float32 in [0, 1]).
-
-    Compiles once for each of a few sizes of windows (`tensors.CAPACITIES`) and each settings.
-    """
+    """(HighPassState, Window of any size) -> (HighPassState, (H, W) float32 in [0, 1])."""
     return advance(state, pack(window, *state.log_intensity.shape), settings)
 
 

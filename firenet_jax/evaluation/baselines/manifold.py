@@ -100,10 +100,7 @@ def initial_state(height: int, width: int, settings: Manifold = Manifold()) -> M
 def step(
     state: ManifoldState, window: Window, settings: Manifold = Manifold()
 ) -> tuple[ManifoldState, jax.Array]:
-    """(ManifoldState, Window of any size) -> (ManifoldState, (H, W) float32 in [0, 1]).
-
-    Compiles once for each of a few sizes of windows (`tensors.CAPACITIES`) and each settings.
-    """
+    """(ManifoldState, Window of any size) -> (ManifoldState, (H, W) float32 in [0, 1])."""
     height, width = state.image.shape
     return advance(state, pack(window, height, width, settings.packet), settings)
 
