@@ -21,11 +21,12 @@ from firenet_jax.simulation.clip import read_clip
 from firenet_jax.simulation.scenes import SceneSettings
 from firenet_jax.simulation.sensor import EPS, SensorSettings, random_sensor
 from firenet_jax.simulation.textures import load_textures
-from firenet_jax.storage import sequence_file
+from firenet_jax.storage import files, sequence_file
+from firenet_jax.storage.arrays import ArraysWriter
 from firenet_jax.storage.files import locked
 from firenet_jax.storage.runs import alone_in
 from firenet_jax.storage.sequence_file import Picture, write_sequence
-from firenet_jax.storage.video import write_video
+from firenet_jax.storage.video import VideoWriter, write_video
 from firenet_jax.warp import warp
 
 HEIGHT, WIDTH = 24, 32
@@ -326,18 +327,23 @@ def test_two_runs_cannot_write_one_file(tmp_path):
     assert concatenate(list(open_recording(path).events())).t.tolist() == events.t.tolist()
 
 
-def test_a_file_that_another_run_has_just_written_is_not_emptied(tmp_path, monkeypatch):
-    path = tmp_path / "a.h5"
-    original = sequence_file.lock_file
+@pytest.mark.parametrize("name", ["sequence.h5", "images.h5", "video.mp4"])
+def test_a_file_that_another_run_has_just_written_is_not_emptied(tmp_path, monkeypatch, name):
+    path = tmp_path / name
+    original = files.lock
 
-    def late(opened, name):  # the other run renames it between our opening it and our lock
-        sequence_file.partial_name(path).replace(path)
+    def late(handle, given):  # the other run renames it between our opening it and our lock
+        files.partial_name(path).replace(path)
         path.write_bytes(b"done")
-        original(opened, name)
+        original(handle, given)
 
-    monkeypatch.setattr(sequence_file, "lock_file", late)
-    with pytest.raises(OutputError):
-        write_sequence(path, iter([]), iter(random_pictures([0, 9])), height=HEIGHT, width=WIDTH)
+    monkeypatch.setattr(files, "lock", late)
+    with pytest.raises(OutputError, match=f"{name}: another run has just written it"):
+        if name == "sequence.h5":
+            pictures = iter(random_pictures([0, 9]))
+            write_sequence(path, iter([]), pictures, height=HEIGHT, width=WIDTH)
+        else:
+            ArraysWriter(path) if name == "images.h5" else VideoWriter(path, None)
     assert path.read_bytes() == b"done"
 
 

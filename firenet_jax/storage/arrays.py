@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 from firenet_jax.storage.disk import Disk
-from firenet_jax.storage.files import lock_file, partial_name, writing
+from firenet_jax.storage.files import open_alone, partial_name, writing
 
 
 class ArraysWriter:
@@ -27,10 +27,7 @@ class ArraysWriter:
     def __init__(self, path: Path):
         self.path, self.partial, self.count = path, partial_name(path), 0
         with writing(path):
-            self.partial.touch()
-            self.held = self.partial.open("r+b", buffering=0)  # "w+b" would empty another run's
-            lock_file(self.held, path)
-            self.held.truncate(0)
+            self.held = open_alone(self.partial, path)
             self.disk = Disk(self.held)
             self.file: Any = h5py.File(self.disk, "w")
 

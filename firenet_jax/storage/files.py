@@ -5,6 +5,7 @@ the error names it.
 """
 
 import contextlib
+import io
 import os
 import re
 from collections.abc import Iterable, Iterator
@@ -129,13 +130,21 @@ def lock(handle: int, path: Path) -> None:
         return
 
 
-def lock_file(file, path: Path) -> None:
-    """Locks an open file as `lock` does; closes it where another run has locked it."""
+def open_alone(beside: Path, path: Path) -> io.FileIO:
+    """The file in the making of `path`, open and empty; no other run can write it meanwhile.
+
+    Raises OutputError where another run is writing it or has just written it."""
+    beside.touch()
+    opened = beside.open("r+b", buffering=0)  # "w+b" would empty another run's
     try:
-        lock(file.fileno(), path)
-    except OutputError:
-        file.close()
+        lock(opened.fileno(), path)
+        if not (beside.exists() and os.path.samestat(os.fstat(opened.fileno()), beside.stat())):
+            raise OutputError(f"{path}: another run has just written it: choose another name")
+        opened.truncate(0)
+    except BaseException:
+        opened.close()
         raise
+    return opened
 
 
 @contextlib.contextmanager

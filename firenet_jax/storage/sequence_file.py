@@ -14,8 +14,6 @@ period. Times the period it is a displacement d for backward warping: what is at
 x - d(x) before.
 """
 
-import contextlib
-import io
 import json
 import os
 from collections.abc import Iterable, Iterator
@@ -25,10 +23,9 @@ from typing import NamedTuple
 import h5py
 import numpy as np
 
-from firenet_jax.errors import OutputError
 from firenet_jax.events import Events, concatenate
 from firenet_jax.storage.disk import Disk
-from firenet_jax.storage.files import lock_file, partial_name, writing
+from firenet_jax.storage.files import open_alone, partial_name, writing
 
 ROWS = 1 << 16  # events in a chunk of the file, and so many are written at once
 GZIP = 4  # for 50 % more time than level 1: events take 10 % less room, flow 25 %
@@ -61,44 +58,31 @@ def write_sequence(
     """
     beside = partial_name(path)
     try:
-        with writing(path), _alone(beside, path) as opened:
-            disk = Disk(opened)
-            with h5py.File(disk, "w") as file:
-                times, flows = _write_pictures(file, disk.during(pictures), height, width)
-                count, facts = _write_events(file, disk.during(events), times)
-                file.attrs.update(
-                    sensor_resolution=np.array([height, width], np.int64),
-                    num_imgs=len(times),
-                    num_flow=flows,
-                    source=source,
-                    settings=json.dumps(settings or {}),
-                    **facts,
-                )
-            disk.check()
-            if os.name == "nt":  # an open file cannot be renamed there, and has no lock
-                opened.close()
-            beside.replace(path)
+        with writing(path), open_alone(beside, path) as opened:
+            try:
+                disk = Disk(opened)
+                with h5py.File(disk, "w") as file:
+                    times, flows = _write_pictures(file, disk.during(pictures), height, width)
+                    count, facts = _write_events(file, disk.during(events), times)
+                    file.attrs.update(
+                        sensor_resolution=np.array([height, width], np.int64),
+                        num_imgs=len(times),
+                        num_flow=flows,
+                        source=source,
+                        settings=json.dumps(settings or {}),
+                        **facts,
+                    )
+                disk.check()
+                if os.name == "nt":  # an open file cannot be renamed there, and has no lock
+                    opened.close()
+                beside.replace(path)
+            except BaseException:
+                beside.unlink(missing_ok=True)
+                raise
     finally:
         for stream in (events, pictures):
             getattr(stream, "close", bool)()  # of generators: ends their threads, closes files
     return count
-
-
-@contextlib.contextmanager
-def _alone(beside: Path, path: Path) -> Iterator[io.FileIO]:
-    """The file in the making, empty; no other run can write it meanwhile. An error removes it."""
-    beside.touch()
-    opened = beside.open("r+b", buffering=0)  # "w+b" would empty another run's
-    lock_file(opened, path)
-    with opened:
-        if not os.path.samestat(os.fstat(opened.fileno()), beside.stat()):
-            raise OutputError(f"{path}: another run has just written it: choose another name")
-        try:
-            opened.truncate(0)
-            yield opened
-        except BaseException:
-            beside.unlink(missing_ok=True)
-            raise
 
 
 def _write_pictures(file, pictures: Iterable[Picture], height, width) -> tuple[np.ndarray, int]:

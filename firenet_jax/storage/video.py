@@ -23,7 +23,7 @@ from PIL import Image
 
 from firenet_jax.errors import OutputError, logger
 from firenet_jax.storage import bag
-from firenet_jax.storage.files import lock_file, locked, partial_name, writing
+from firenet_jax.storage.files import locked, open_alone, partial_name, writing
 from firenet_jax.storage.runs import make_folder
 
 VIDEOS = (".mp4", ".gif")
@@ -259,8 +259,7 @@ class VideoWriter:
         self.left_out = 0  # ticks of pauses
         self.count = 0
         with writing(path):
-            self.held = self.partial.open("ab")
-            lock_file(self.held, path)
+            self.held = open_alone(self.partial, path)
             # absolute, for FFmpeg takes what precedes a colon for a protocol
             self.container = av.open(str(self.partial.absolute()), "w")
         self.stream: Any = None
