@@ -943,6 +943,43 @@ def test_raw(tmp_path, version):
 
 
 @pytest.mark.parametrize(
+    "header, legacy",
+    [
+        ("format EVT21;endianness=legacy;height=480;width=640", True),  # of IMX636
+        ("format EVT21;height=480;width=640\n% endianness legacy", True),
+        ("evt 2.1\n% geometry 640x480", True),
+        ("format EVT21;endianness=little;height=480;width=640", False),  # of GenX320
+        ("endianness little\n% format EVT21;height=480;width=640", False),
+    ],
+)
+def test_evt21(tmp_path, monkeypatch, header, legacy):
+    """Events of several pixels at once, and edges, across the end of the clock's 34 bits."""
+    pytest.importorskip("faery")
+    monkeypatch.setattr(camera, "CHUNK", 100)
+    rng = np.random.default_rng(0)
+    words, events, edges = [(1 << 28 | 3, 1)], [], []  # an event before the first time
+    for t in np.cumsum(rng.integers(1, 400, 500)).tolist():
+        t += 2**34 - 50_000
+        x, y, p = rng.integers(0, (608, 480, 2)).tolist()
+        pixels = int(rng.integers(1, 2**32)) if t % 2 else 1 << t % 32
+        words.append((0x8 << 28 | t >> 6 & 0xFFFFFFF, 0))
+        words.append((p << 28 | (t & 63) << 22 | x << 11 | y, pixels))
+        words.append((0xA << 28 | (t & 63) << 22 | y % 32 << 8 | p, 0))
+        words.append((0xE << 28 | (t & 63) << 22 | 0x14, 0x10203040))  # a count of events
+        events += [(t, x + i, y, p) for i in range(32) if pixels >> i & 1]
+        edges.append((t, y % 32, p))
+    words = np.array(words, "<u4")[:, :: 1 if legacy else -1]
+    content = f"% {header}\n% end\n".encode() + words.tobytes()
+    path = write(tmp_path / "a.raw", content)
+    check(path, *np.array(events).T, size=None)
+    recording = open_recording(path)
+    assert recording.format == "Prophesee raw (EVT2.1)" and recording.width == 640
+    found = recording.triggers()
+    assert list(zip(*(column.tolist() for column in found), strict=True)) == edges
+    refused(write(tmp_path / "cut.raw", content[:-3]), "ends within a word", size=None)
+
+
+@pytest.mark.parametrize(
     "header, size",
     [
         ("% evt 2.0\n", None),

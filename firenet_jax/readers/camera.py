@@ -4,8 +4,8 @@
               of the sensor is taken from the header only (faery guesses 1280x720 without)
     .es       Event Stream: 5 bytes an event, rows counted from the bottom (faery turns them round)
 
-Edges at trigger inputs are read without faery, which skips them (evt2.py, evt3.py; those of EVT2.1
-are not read). Times are microseconds. faery clamps a time that falls below an earlier one to that
+EVT2.1 and edges at trigger inputs are read without faery, which knows neither (evt2.py, evt21.py,
+evt3.py). Times are microseconds. faery clamps a time that falls below an earlier one to that
 one. The times of an EVT3 file that begins within 8 ms of its clock's end are wrong by up to 16.8 s
 in faery 0.7, so that such a file is read without it, too. A .raw or .es file that was cut off
 between two words looks whole: neither says how long it is.
@@ -22,14 +22,29 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Rows, Triggers
-from firenet_jax.readers import CHUNK, Source, all_triggers, evt2, evt3, extra, joined, to_events
+from firenet_jax.readers import (
+    CHUNK,
+    Source,
+    all_triggers,
+    evt2,
+    evt3,
+    evt21,
+    extra,
+    joined,
+    to_events,
+)
 from firenet_jax.readers.dat import header_size, read_header
 
 FORMATS = {".raw": "Prophesee raw", ".es": "Event Stream"}
 WORD = {"2": 4, "2.0": 4, "2.1": 8, "21": 8, "3": 2, "3.0": 2}  # EVT version: bytes of a word
-EVT3 = np.dtype("<u2")
+EVT3, EVT21 = np.dtype("<u2"), np.dtype("<u8")
 # of triggers, by EVT version: function, state at the beginning, type of a word
-DECODERS = {"2": (evt2.triggers, -1, np.dtype("<u4")), "3": (evt3.triggers, evt3.State(), EVT3)}
+DECODERS = {
+    "2": (evt2.triggers, -1, np.dtype("<u4")),
+    "2.1 legacy": (partial(evt21.triggers, True), -1, EVT21),
+    "2.1": (partial(evt21.triggers, False), -1, EVT21),
+    "3": (evt3.triggers, evt3.State(), EVT3),
+}
 LATE = 4094  # from here on faery takes the first time high of an EVT3 file for a fall from 0
 LARGEST = (2048, 2048)  # what EVT's 11 bits reach, so that faery refuses nothing
 
@@ -50,9 +65,10 @@ def read(path: Path) -> Source:
         with _guarded(path):
             width, height = faery.events_stream_from_file(path).dimensions()
         size = (height, width)
-    version = version[:1] if WORD.get(version) != 8 else ""
 
     def columns() -> Iterator[Columns]:
+        if version.startswith("2.1"):
+            return _of_evt21(path, start, version == "2.1 legacy")
         if version == "3" and _first_high(path, start) >= LATE:
             return _of_evt3(path, start)
         own = {"2": _of_evt2, "3": _of_evt3}.get(version)
@@ -69,7 +85,7 @@ def read(path: Path) -> Source:
 
 def _raw_header(path: Path) -> tuple[str, tuple[int, int] | None, bool, str, int]:
     """-> "Prophesee raw (EVT3)", (height, width) where the header states it, whether the last word
-    is cut off, the EVT version, where words begin, bytes from the beginning of the file"""
+    is cut off, a key of `DECODERS`, where words begin, bytes from the beginning of the file"""
     with open(path, "rb") as file:
         header = read_header(file)
         start = file.tell()
@@ -80,12 +96,15 @@ def _raw_header(path: Path) -> tuple[str, tuple[int, int] | None, bool, str, int
             "of another format"
         )
     cut = (path.stat().st_size - start) % WORD[version[1]] > 0
-    name = f"Prophesee raw (EVT{version[1].removesuffix('.0')})"
-    return name, header_size(header), cut, version[1], start
+    known = "2.1" if WORD[version[1]] == 8 else version[1][0]
+    name = f"Prophesee raw (EVT{known})"
+    if known == "2.1" and evt21.is_legacy(header):
+        known = "2.1 legacy"
+    return name, header_size(header), cut, known, start
 
 
 def _triggers(path: Path, version: str, start: int) -> Triggers | None:
-    """version: "2" or "3"; of any other no triggers are read."""
+    """version: a key of `DECODERS`; of any other no triggers are read."""
     if version not in DECODERS:
         return None
     decode, state, kind = DECODERS[version]
@@ -166,6 +185,14 @@ def _of_evt2(path: Path, start: int) -> Iterator[Columns]:
     for words in _words(path, start, np.dtype("<u4")):
         high, columns = evt2.decode(high, words)
         yield columns
+
+
+def _of_evt21(path: Path, start: int, legacy: bool) -> Iterator[Columns]:
+    high, latest = -1, -1
+    for words in _words(path, start, EVT21, CHUNK // 32 + 1):  # of up to 32 events
+        high, (t, x, y, p) = evt21.decode(legacy, high, words)
+        latest, t = evt3.without_jitter(latest, t)
+        yield t, x, y, p
 
 
 def _of_evt3(path: Path, start: int) -> Iterator[Columns]:

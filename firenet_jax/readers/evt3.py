@@ -55,11 +55,15 @@ def decode(state: State, words: np.ndarray) -> tuple[State, tuple[np.ndarray, ..
     known = (time >= 0) & (y >= 0)
     base, (word, x, on) = expand(state.base, load, kind == 0x3, kind == 0x2, width, known)
 
-    t = time[word]
-    latest = np.maximum.accumulate(np.append(state.latest, t))
-    t = np.where(latest[1:] - t <= JITTER, latest[1:], t)
-    state = State(int(times[-1]), int(latest[-1]), high, int(rows[-1]), base)
+    latest, t = without_jitter(state.latest, time[word])
+    state = State(int(times[-1]), latest, high, int(rows[-1]), base)
     return state, (t, x, y[word], on)
+
+
+def without_jitter(latest: int, t: np.ndarray) -> tuple[int, np.ndarray]:
+    """The latest time before them, (N,) int64 -> the latest one, the times without small falls."""
+    highest = np.maximum.accumulate(np.append(latest, t))
+    return int(highest[-1]), np.where(highest[1:] - t <= JITTER, highest[1:], t)
 
 
 def triggers(state: State, words: np.ndarray) -> tuple[State, tuple[np.ndarray, ...]]:

@@ -1,0 +1,40 @@
+"""EVT2.1 words -> events: those of EVT2 for up to 32 pixels of a row at once, 64 bits each.
+
+One half is a word of EVT2 (evt2.py), whose x is that of the first pixel. Of an event the other half
+says which pixels it is of: bit i, that at x + i. Which half comes first depends on the sensor, and
+headers say it as `endianness`: the word of EVT2 in files of Gen4.1, IMX636 and IMX646 ("legacy"),
+the pixels in those of later ones ("little").
+"""
+
+import re
+
+import numpy as np
+
+from firenet_jax.readers import evt2
+
+
+def is_legacy(header: str) -> bool:
+    """As is a file that does not say: it is older than the later sensors."""
+    return re.search(r"endianness[ =]little", header) is None
+
+
+def decode(legacy: bool, high: int, words: np.ndarray) -> tuple[int, tuple[np.ndarray, ...]]:
+    """As `evt2.decode`, of (N,) uint64."""
+    heads, pixels = _halves(legacy, words)
+    high, columns = evt2.decode(high, heads)
+    pixels = pixels[heads >> 28 < 2]
+    pixels = pixels[len(pixels) - len(columns[0]) :]  # without those before the first time high
+    event, bit = np.nonzero(pixels[:, None] >> np.arange(32, dtype=np.uint32) & 1)
+    t, x, y, p = (column[event] for column in columns)
+    return high, (t, x + bit, y, p)
+
+
+def triggers(legacy: bool, high: int, words: np.ndarray) -> tuple[int, tuple[np.ndarray, ...]]:
+    """As `evt2.triggers`, of (N,) uint64."""
+    return evt2.triggers(high, _halves(legacy, words)[0])
+
+
+def _halves(legacy: bool, words: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """-> the words of EVT2, the pixels; (N,) uint32 each."""
+    low, high = words.view("<u4").reshape(-1, 2).T
+    return (low, high) if legacy else (high, low)
