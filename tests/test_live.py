@@ -8,8 +8,10 @@ import itertools
 import json
 import socket
 import struct
+import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -180,6 +182,37 @@ def test_tcp_reads_until_the_sender_ends():
 def test_nobody_there_is_one_sentence():
     with pytest.raises(RecordingError, match="start the program that sends"):
         next(sources.tcp("127.0.0.1", 1))
+
+
+def test_a_camera_that_is_unplugged_is_one_sentence(monkeypatch):
+    """Against a driver with the interface of neuromorphic_drivers 0.18."""
+    events = some_events()
+    kind = [("t", "<u8"), ("x", "<u2"), ("y", "<u2"), ("on", "?")]
+    packet = SimpleNamespace(polarity_events=np.array(rows(events), kind))
+
+    class Device(contextlib.nullcontext):
+        def name(self):
+            return SimpleNamespace(value="a camera")
+
+        def properties(self):
+            return SimpleNamespace(width=WIDTH, height=HEIGHT)
+
+        def __enter__(self):
+            return self
+
+        def __iter__(self):
+            yield from (
+                (None, one) for one in (packet, None, SimpleNamespace(polarity_events=None))
+            )
+            raise RuntimeError("No such device (it may have been disconnected)")
+
+    driver = SimpleNamespace(open=lambda iterator_timeout: Device())
+    monkeypatch.setitem(sys.modules, "neuromorphic_drivers", driver)
+    source, found = sources.camera(), []
+    assert source[:3] == ("a camera", HEIGHT, WIDTH)
+    with pytest.raises(RecordingError, match="a camera: gives no more events .No such device"):
+        found.extend(source.arrivals)
+    assert rows(concatenate(found)) == rows(events) and len(found) == 3
 
 
 def test_a_growing_file(tmp_path):

@@ -258,13 +258,22 @@ def camera() -> Source:
             ) from error
         properties, closing = device.properties(), opened.pop_all()
 
+    name = str(device.name().value)
+
     def arrivals():
+        packets = iter(device)
         with closing:
-            for _, packet in device:
+            while True:
+                try:
+                    _, packet = next(packets)
+                except Exception as error:  # whatever the driver raises where it is unplugged
+                    raise RecordingError(
+                        f"{name}: gives no more events ({error}): is it still plugged in?"
+                    ) from error
                 rows = None if packet is None else packet.polarity_events
                 if rows is None or not len(rows):
                     yield NO_EVENTS
                 else:
                     yield Events.of(rows["t"], rows["x"], rows["y"], rows["on"])
 
-    return Source(str(device.name().value), properties.height, properties.width, arrivals())
+    return Source(name, properties.height, properties.width, arrivals())
