@@ -513,6 +513,9 @@ def test_a_recording_played(tmp_path, monkeypatch, capsys):
         ("a.txt --replay --longest 0.0004", "longest"),
         ("a.txt --replay --longest inf", "longest"),
         ("a.txt --replay --port 70000", "ports are 0 to 65535"),
+        ("a.txt --sensor-size 20x12 --speed 2 --repeat 3", "speed, repeat: no part in a stream"),
+        ("a.txt --replay --wire text", "wire: no part in a replay"),
+        ("camera --sensor-size 20x12", "sensor-size: no part in a camera"),
     ],
 )
 def test_mistakes_are_one_sentence(tmp_path, monkeypatch, capsys, arguments, expected):

@@ -80,6 +80,14 @@ class Live:
         if not 0 <= self.port < 2**16:
             raise SettingsError(f"port is {self.port}, but ports are 0 to 65535")
         Windows(events_per_pixel=self.events_per_pixel, longest=self.longest)  # checks them
+        camera = not self.replay and self.source == "camera"
+        idle = ["wire"] if self.replay else ["speed", "repeat"]
+        idle += ["wire", "sensor_size"] if camera else []
+        idle = [name for name in idle if getattr(self, name) != getattr(Live, name)]
+        if idle:
+            what = "replay" if self.replay else "camera" if camera else "stream (without --replay)"
+            said = ", ".join(idle).replace("_", "-")
+            raise SettingsError(f"{said}: no part in a {what}: leave it out")
 
 
 def source_of(settings: Live) -> sources.Source:
