@@ -547,6 +547,21 @@ def test_hdf5_without_its_compression(tmp_path, monkeypatch):
     refused(tmp_path / "events.h5", "hdf5plugin", 'pip install "firenet-jax[formats]"')
 
 
+@pytest.mark.parametrize("number, name", [(36559, "Metavision's ECF"), (40001, "filter 40001")])
+def test_hdf5_whose_compression_has_no_plugin(tmp_path, number, name):
+    pytest.importorskip("hdf5plugin")
+    kind = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
+    with h5py.File(tmp_path / "events.h5", "w") as file:
+        stored = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        stored.set_chunk((100,))
+        stored.set_filter(number, h5py.h5z.FLAG_OPTIONAL, ())
+        space, kind = h5py.h5s.create_simple((100,)), h5py.h5t.py_create(kind)
+        group = file.create_group("CD").id
+        data = h5py.Dataset(h5py.h5d.create(group, b"events", kind, space, stored))
+        data.id.write_direct_chunk((0,), b"packed")
+    refused(tmp_path / "events.h5", f"compressed by {name}", "HDF5_PLUGIN_PATH")
+
+
 def test_hdf5_mvsec(tmp_path):
     path = tmp_path / "indoor.hdf5"
     with h5py.File(path, "w") as file:

@@ -33,6 +33,7 @@ SIGNATURE = b"\x89HDF\r\n\x1a\n"
 COLUMNS = {"event_cnn_minimal": ("ts", "xs", "ys", "ps"), "DSEC": ("t", "x", "y", "p")}
 MVSEC = "davis/left"
 METAVISION = "CD/events"
+ECF = 36559  # number of Metavision's compression
 
 
 def matches(path: Path) -> bool:
@@ -142,8 +143,9 @@ def _reader(path: Path, file: Any, layout: str) -> tuple[Read, int]:
 
 
 def _check_stored(path: Path, data: Any):
-    """Refuses data that lies in other files: whoever made this file would choose which are read.
-    Imports hdf5plugin, which registers further compressions, where h5py alone lacks one."""
+    """Refuses data that lies in other files: whoever made this file would choose which are read;
+    and compressions that HDF5 has no plugin for. Imports hdf5plugin, which registers further ones,
+    where h5py alone lacks one."""
     # a link to another file, and a virtual data set, would do the same
     if data.external or data.is_virtual or Path(data.file.filename) != path:
         raise RecordingError(
@@ -153,6 +155,12 @@ def _check_stored(path: Path, data: Any):
     for number in (created.get_filter(i)[0] for i in range(created.get_nfilters())):
         if not h5py.h5z.filter_avail(number):
             extra("hdf5plugin", path)
+            if not h5py.h5z.filter_avail(number):
+                name = "Metavision's ECF" if number == ECF else f"filter {number}"
+                raise RecordingError(
+                    f"{path}: {data.name} is compressed by {name}, whose HDF5 plugin is not found: "
+                    "install it and name its folder in HDF5_PLUGIN_PATH, or convert the file"
+                )
 
 
 def _events(path: Path, layout: str) -> Iterator[Events | Rows]:
