@@ -22,7 +22,7 @@ from firenet_jax.simulation.sensor import Simulation
 from firenet_jax.storage.files import locked
 from firenet_jax.storage.sequence_file import Picture, write_sequence
 from firenet_jax.training.settings import Train
-from firenet_jax.training.step import loss_of, near_events
+from firenet_jax.training.step import initial_train_state, loss_of, near_events, train_step
 
 SIZE, FRAMES, EVERY = 40, 20, 10_000
 ZERO = 1_600_000_000_000_000  # microseconds since 1970, as DAVIS cameras count
@@ -254,6 +254,31 @@ def test_what_no_event_tells_of_teaches_brightness_alone(tmp_path):
     brighter = np.where(np.arange(32)[:, None] < 12, images, images + 0.2)
     assert np.abs(gradient(brighter) - first).max() > 1e-4
     assert np.abs(gradient(close) - first).max() > 1e-4
+
+
+def test_what_is_near_events_stays_so_through_a_chain(tmp_path):
+    """Two steps of a sequence, events in the first one's corner alone: there the frames of the
+    second count as they are, and those of a new sequence after it do not."""
+    settings = tiny(tmp_path, near_events=True, chain=2, batch=1, warmup=0).step_settings
+    rng = np.random.default_rng(0)
+    images = rng.random((3, 1, 32, 32)).astype(np.float32)
+    close, still = images.copy(), (jnp.zeros((3, 1, 32, 32, 2)), jnp.zeros((3, 1, 32, 32), bool))
+    close[..., :8, :8] = close[..., :8, 7::-1]  # of the same mean
+    silent = np.zeros((3, 1, 32, 32, 5), np.float32)
+    corner = silent.copy()
+    corner[:, :, :8, :8] = rng.normal(size=(3, 1, 8, 8, 5))
+
+    def loss_after(tensors, pictures):
+        """Of the last of these steps."""
+        state, terms = initial_train_state(initial_params(jax.random.key(0)), settings, False), {}
+        for one, shown in zip(tensors, pictures, strict=True):
+            state, terms = train_step(state, Simulation(one, shown, *still), settings)
+        return float(terms["loss"])
+
+    first, second = loss_after([corner, silent], [images] * 2), [images, close]
+    assert abs(loss_after([corner, silent], second) - first) > 1e-4
+    third = loss_after([corner, silent, silent], [images] * 3)
+    assert abs(loss_after([corner, silent, silent], [images, images, close]) - third) < 1e-5
 
 
 def test_ssim_where_is_the_mean_of_the_map_there():

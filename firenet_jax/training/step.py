@@ -79,7 +79,9 @@ class TrainState(NamedTuple):
     params: Any
     optimiser: Any
     step: jax.Array | np.int32  # () int32
-    carried: tuple[SensorState, State] | None  # of sequences that continue, with `chain` > 1
+    # Of sequences that continue, with `chain` > 1: the sensor's state, the network's and, with
+    # `near_events`, (B, H, W) bool, where events have been near.
+    carried: tuple[Any, ...] | None
 
 
 def optimiser(settings: StepSettings) -> optax.GradientTransformation:
@@ -122,6 +124,9 @@ def initial_train_state(params: Any, settings: StepSettings, simulates: bool = T
         )
         carried = jax.eval_shape(partial(_fresh, settings=settings), *setups)
         carried = carried if simulates else (None, carried[1])
+        if settings.near_events:
+            shape = settings.batch, settings.crop, settings.crop
+            carried = *carried, jax.ShapeDtypeStruct(shape, bool)
         carried = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), carried)
         carried = jax.device_put(carried, sharding(BATCH))
     begun = TrainState(params, optimiser(settings).init(params), np.int32(0), None)
@@ -260,18 +265,23 @@ def near_events(tensors: jax.Array) -> jax.Array:
     return jax.lax.cummax(there) > 0
 
 
-def loss_of(params, data: Simulation, state: State | None, warm, settings: StepSettings):
-    """(loss, (its terms, last state, images)) of all devices' sequences."""
+def loss_of(
+    params, data: Simulation, state: State | None, warm, settings: StepSettings, near=False
+):
+    """(loss, (its terms, last state, images)) of all devices' sequences.
+
+    near: (1, B, H, W) bool, where events have been near before, with `near_events`.
+    """
+    if settings.near_events:  # the mean elsewhere: without a loss the image would drift there
+        level = data.images.mean((-2, -1), keepdims=True)
+        there = near_events(data.tensors) | near
+        data = data._replace(images=jnp.where(there, data.images, level))
     # Frozen blocks have a gradient of zero: it is not computed, and no optimiser moves them by it.
     params = params | {k: jax.lax.stop_gradient(params[k]) for k in settings.frozen}
 
     def one_device(params, data, state, warm):
         last, images = images_of(params, data.tensors, settings, state)
-        truths = data.images
-        if settings.near_events:  # the mean elsewhere: without a loss the image would drift there
-            level = truths.mean((-2, -1), keepdims=True)
-            truths = jnp.where(near_events(data.tensors), truths, level)
-        truth = truths, data.displacement, data.visible
+        truth = data.images, data.displacement, data.visible
         losses = sequence_loss(images, *truth, settings.loss, warm)
         return jax.lax.pmean(losses, "devices"), (last, images)
 
@@ -285,11 +295,16 @@ def loss_of(params, data: Simulation, state: State | None, warm, settings: StepS
 
 
 def _updated(
-    state: TrainState, data: Simulation, before: State | None, warm, settings: StepSettings
+    state: TrainState,
+    data: Simulation,
+    before: State | None,
+    warm,
+    settings: StepSettings,
+    near=False,
 ):
     """(state, data, the network's state before it) -> (state, losses), the network's state."""
     both = jax.value_and_grad(loss_of, has_aux=True)
-    (loss, (terms, last, _)), gradient = both(state.params, data, before, warm, settings)
+    (loss, (terms, last, _)), gradient = both(state.params, data, before, warm, settings, near)
     updates, optimised = optimiser(settings).update(gradient, state.optimiser, state.params)
     params = optax.apply_updates(state.params, updates)
     terms = {"loss": loss, "gradient": optax.tree.norm(gradient), **terms}
@@ -317,8 +332,16 @@ def train_step(
     else:
         key, textures = source
         data, (seen, before), warm = _simulated(key, textures, settings, state)
-    state, terms, last = _updated(state, data, before, warm, settings)
-    return state._replace(carried=(seen, last) if settings.chain > 1 else None), terms
+    remembers = settings.near_events and settings.chain > 1
+    near = False
+    if remembers:
+        near = (cast(tuple, state.carried)[2] & jnp.asarray(warm)[:, None, None])[None]
+    state, terms, last = _updated(state, data, before, warm, settings, near)
+    carried = (seen, last) if settings.chain > 1 else None
+    if remembers:
+        now = (near | near_events(data.tensors)[-1:])[0]
+        carried = seen, last, jax.lax.with_sharding_constraint(now, sharding(BATCH))
+    return state._replace(carried=carried), terms
 
 
 @partial(jax.jit, static_argnames="settings")
