@@ -1,5 +1,6 @@
 import itertools
 import json
+import sys
 from dataclasses import replace
 
 import h5py
@@ -365,9 +366,21 @@ def instead(file: h5py.File, name: str):
     file[name] = np.dtype("f8")
 
 
+def elsewhere(file: h5py.File, name: str):
+    """Its values in another file, which whoever made this one chooses."""
+    shape, kind = file[name].shape, file[name].dtype
+    attributes = dict(file[name].attrs)
+    del file[name]
+    kept = file.create_dataset(name, shape, kind, external=[("other", 0, h5py.h5f.UNLIMITED)])
+    kept.attrs.update(attributes)
+
+
 @pytest.mark.parametrize(
     "damage, expected",
     [
+        (lambda f: elsewhere(f, "events/xs"), "events/xs is stored in other files"),
+        (lambda f: elsewhere(f, "images/image000000003"), "is stored in other files"),
+        (lambda f: elsewhere(f, "flow/flow000000003"), "is stored in other files"),
         (lambda f: f.__delitem__("events/xs"), "cannot be read"),
         (lambda f: instead(f, "images"), "cannot be read"),
         (lambda f: instead(f, "images/image000000000"), "cannot be read"),
@@ -385,6 +398,13 @@ def test_damage_is_said(tmp_path, damage, expected):
     with h5py.File(path, "r+") as file:
         damage(file)
     assert expected in refused(path, windows=IMAGES - 1)
+
+
+def test_a_compression_that_h5py_lacks_is_said(noise, monkeypatch):
+    """As for recordings: with hdf5plugin it is read, without it is named."""
+    monkeypatch.setattr(h5py.h5z, "filter_avail", lambda number: False)
+    monkeypatch.setitem(sys.modules, "hdf5plugin", None)
+    assert 'hdf5plugin: pip install "firenet-jax[formats]"' in refused(noise[0])
 
 
 def test_pictures_and_flow_of_other_sizes_are_said(tmp_path):

@@ -103,7 +103,7 @@ def _reader(path: Path, file: Any, layout: str) -> tuple[Read, int]:
     """(rows -> Events, number of rows)"""
     if layout in ("MVSEC", "v2e"):
         events = file[f"{MVSEC}/events" if layout == "MVSEC" else "events"]
-        _check_stored(path, events)
+        check_stored(path, events)
         if events.ndim != 2 or events.shape[1] != 4:
             raise RecordingError(
                 f"{path}: {events.name.strip('/')} has the shape {events.shape}, expected (N, 4)"
@@ -112,7 +112,7 @@ def _reader(path: Path, file: Any, layout: str) -> tuple[Read, int]:
         return lambda rows: to_events(path, rows.start, *events[rows].T[order]), len(events)
     if layout == "Metavision":
         events = file[METAVISION]
-        _check_stored(path, events)
+        check_stored(path, events)
         if not set("txyp") <= set(events.dtype.names or ()) or events.ndim != 1:
             raise RecordingError(
                 f"{path}: {METAVISION} is {events.dtype} of shape {events.shape}, expected rows "
@@ -127,7 +127,7 @@ def _reader(path: Path, file: Any, layout: str) -> tuple[Read, int]:
 
     columns = [file["events"][name] for name in COLUMNS[layout]]
     for column in columns:
-        _check_stored(path, column)
+        check_stored(path, column)
     if len({column.shape for column in columns}) != 1 or columns[0].ndim != 1:
         found = ", ".join(f"{column.name} {column.shape}" for column in columns)
         raise RecordingError(f"{path}: its columns differ in length: {found}")
@@ -142,7 +142,7 @@ def _reader(path: Path, file: Any, layout: str) -> tuple[Read, int]:
     return read, len(columns[0])
 
 
-def _check_stored(path: Path, data: Any):
+def check_stored(path: Path, data: Any):
     """Refuses data that lies in other files: whoever made this file would choose which are read;
     and compressions that HDF5 has no plugin for. Imports hdf5plugin, which registers further ones,
     where h5py alone lacks one."""
@@ -232,7 +232,7 @@ def _mvsec_frames(path: Path, left: Any) -> Frames | None:
 
 def _frame(path: Path, name: str, index) -> np.ndarray:
     with opened(path) as file:
-        _check_stored(path, file[name])
+        check_stored(path, file[name])
         return to_frame(file[name][index], path)
 
 
@@ -241,7 +241,7 @@ def _flow(path: Path, name: str) -> np.ndarray | None:
         if name not in file:
             return None
         velocity = file[name]
-        _check_stored(path, velocity)
+        check_stored(path, velocity)
         size = (2, *file["images"][name.removeprefix("flow/").replace("flow", "image")].shape[:2])
         if velocity.shape != size:
             raise RecordingError(f"{path}, {name}: has the shape {velocity.shape}, expected {size}")

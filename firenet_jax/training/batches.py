@@ -28,7 +28,7 @@ import numpy as np
 from firenet_jax.errors import RecordingError, SettingsError, logger
 from firenet_jax.events import BINS, Events, Rows, checked, concatenate, counted, event_number
 from firenet_jax.readers import CHUNK, frame_times, to_events, to_frame
-from firenet_jax.readers.hdf5 import in_order, opened
+from firenet_jax.readers.hdf5 import check_stored, in_order, opened
 from firenet_jax.settings import check_sizes
 from firenet_jax.simulation.sensor import Simulation
 from firenet_jax.storage.files import files_in
@@ -145,7 +145,7 @@ def _facts(path: Path) -> Facts:
                 "events between them: take the file out of the folder"
             )
         for name in ("xs", "ys", "ts", "ps"):
-            file["events"][name]
+            check_stored(path, file["events"][name])
         height, width = images[next(iter(images))].shape[:2]
         sensor = tuple(int(side) for side in file.attrs.get("sensor_resolution", (height, width)))
     if sensor[:2] != (height, width):
@@ -232,14 +232,14 @@ def _example(
         events = _cropped(_read_events(file, facts, rows), top, left, crop, down, across)
         for end in np.unique(ends):
             name = index.names[end]
-            image = to_frame(file["images"][name][()], facts.path)
+            image = to_frame(_whole(facts.path, file["images"][name]), facts.path)
             _check_shape(facts.path, name, image, shape)
             images[end] = image[cut][turn]
         for end in ends[~paused]:
             name = index.names[end].replace("image", "flow")
             moved = np.full((2, crop, crop), np.nan, np.float32)
             if name in file.get("flow", ()):
-                velocity = file["flow"][name][()]  # pixels per second
+                velocity = _whole(facts.path, file["flow"][name])  # pixels per second
                 _check_shape(facts.path, name, velocity, (2, *shape))
                 seconds = np.float32(1e-6 * (index.times[end] - index.times[end - 1]))
                 moved = seconds * velocity[cut][turn].astype(np.float32)
@@ -284,6 +284,11 @@ def _cropped(events: Events, top, left, crop: int, down, across) -> Events:
         crop - 1 - y if down else y,
         events.p[inside],
     )
+
+
+def _whole(path: Path, data: Any) -> np.ndarray:
+    check_stored(path, data)
+    return data[()]
 
 
 def _check_shape(path: Path, name: str, found: np.ndarray, expected: tuple[int, ...]) -> None:
