@@ -29,6 +29,7 @@ from firenet_jax.storage.sequence_file import Picture, write_sequence
 from firenet_jax.training import run as train
 from firenet_jax.training import settings as train_settings
 from firenet_jax.training import step as train_steps
+from firenet_jax.training.batches import Augment
 from firenet_jax.training.log import Log
 from firenet_jax.training.losses import Loss
 from firenet_jax.training.run import Train, first_state, run
@@ -44,6 +45,8 @@ def tiny(folder, **kwargs):
         "textures": 4, "log_every": 1, "validate_every": 3, "save_every": 0.0,
         "loss": SHORT, "scene": SceneSettings(objects=0),
     }  # fmt: skip
+    if "data" in kwargs:  # of simulated sequences
+        del choices["textures"], choices["scene"]
     return Train(folder, **(choices | kwargs))
 
 
@@ -539,6 +542,9 @@ def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypa
         ({"crop": 16, "loss": Loss(cw_ssim=1, l0=1)}, "--cw-ssim needs 17 or more"),
         ({"chain": 2400}, "2400 steps of 3 windows, .* at most 7158 windows"),
         ({"motion": (0.0, 2.0)}, "motion is 0 2"), ({"motion": (2.0, 1.0)}, "the least first"),
+        ({"data": (Path("a"),), "images": Path("b"), "scene": SceneSettings(shake=0.5)},
+         "^images, shake: no part in training on sequences from --data"),
+        ({"augment": Augment(hot_pixels=0)}, "^hot-pixels: no part in training on simulated"),
         ({"seed": -3}, "seed is -3"), ({"seed": 5_000_000_000}, "less than 2"),
     ],
 )  # fmt: skip

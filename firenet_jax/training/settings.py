@@ -22,6 +22,10 @@ from firenet_jax.training.losses import DISTANCES, Loss
 from firenet_jax.training.step import StepSettings
 
 Block = Literal["head", "gru1", "res1", "gru2", "res2", "prediction"]
+SIMULATED = (  # settings of sequences that are simulated
+    "images", "textures", "procedural", "renderings", "motion", "slow", "swift", "to_and_fro",
+    "scene", "sensor",
+)  # fmt: skip
 MIN_CROP = 11  # pixels on a side of what validation measures: SSIM's window
 MIN_CROP_CW_SSIM = 17  # what the filters of CW-SSIM need
 
@@ -131,6 +135,7 @@ class Train:
             raise SettingsError(
                 f"crop is {self.crop} pixels, but images smaller than {MIN_CROP} cannot be judged"
             )
+        _check_idle(self)
         check_range("motion", self.motion)
         _check_step(self)
         check_rare(self.slow, self.swift)
@@ -166,6 +171,22 @@ class Train:
         chosen: dict[str, Any] = {name: getattr(self, name) for name in names}
         chosen["warmup"] = warming_up(self)
         return StepSettings(**chosen)
+
+
+def _check_idle(settings: Train) -> None:
+    """Raises SettingsError for what would have no effect on this kind of data."""
+    names = []
+    for name in SIMULATED if settings.data else ("augment",):
+        now, default = getattr(settings, name), getattr(Train, name)
+        if dataclasses.is_dataclass(default):
+            inner = (field.name for field in dataclasses.fields(default))
+            names += [n for n in inner if getattr(now, n) != getattr(default, n)]
+        elif now != default:
+            names.append(name)
+    if names:
+        kind = "sequences from --data" if settings.data else "simulated sequences"
+        said = ", ".join(names).replace("_", "-")
+        raise SettingsError(f"{said}: no part in training on {kind}: leave it out")
 
 
 def _check_step(settings: Train) -> None:
