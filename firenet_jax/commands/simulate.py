@@ -36,6 +36,7 @@ from firenet_jax.simulation.scenes import (
 from firenet_jax.simulation.sensor import (
     FLICKER_INTERVAL,
     SensorSettings,
+    check_idle,
     event_list,
     random_sensor,
     with_faults,
@@ -123,6 +124,7 @@ class Simulate:
         check_seed(self.seed)
         parse_size(self.sensor_size)
         share(self.process, self.processes)
+        check_idle(with_faults(self.sensor) if self.faults else self.sensor)
         if self.video is not None:
             idle = [name for name in OF_SCENES if getattr(self, name) != getattr(Simulate, name)]
             if idle:

@@ -170,6 +170,21 @@ def with_faults(sensor: SensorSettings) -> SensorSettings:
     return dataclasses.replace(FAULTY, **chosen)
 
 
+def check_idle(sensor: SensorSettings) -> None:
+    """Raises SettingsError for what says more of a fault that is off, and so has no effect."""
+    for name, needed in (
+        ("asymmetry", "threshold_range"),
+        ("noise_in_light", "noise"),
+        ("cutoff_dark", "cutoff"),
+    ):
+        said = getattr(sensor, name) != getattr(SensorSettings, name)
+        if said and not _on(getattr(sensor, needed)):
+            more, option = name.replace("_", "-"), needed.replace("_", "-")
+            raise SettingsError(
+                f"--{more} says more of --{option}, which is not asked for: pass that, too"
+            )
+
+
 class Lamp(NamedTuple):
     """Light that flickers: intensity is multiplied by 1 + swing sin(2 pi cycles)."""
 
