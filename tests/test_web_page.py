@@ -114,6 +114,11 @@ TEXTS = {
     "windows.txt": "\ufeff% made elsewhere\r\n1000\t3\t4\t1\r\n2500\t9\t5\t0",
     "metavision.csv": "%geometry:40,30\n3,4,1,1000\n9,5,0,2500\n",
     "exponent.txt": "1e-3 3 4 1\n25e-4 9 5 0\n",
+    "nanoseconds.txt": "# t_ns x y p\n1000999 3 4 1\n2500000 9 5 0\n",
+    "microseconds.csv": "x,y,p,t_us\n3,4,1,1000\n9,5,0,2500\n",
+    "milliseconds.csv": '"time [ms]","x (px)",y,p\n1.0,3,4,1\n2.5,9,5,0\n',
+    "seconds.txt": "%t(s) x y p\n1 3 4 1\n2 9 5 0\n",
+    "both.csv": "t_s,t_us,x,y,p\n0,1000,3,4,1\n0,2500,9,5,0\n",
 }
 READ = """
 import fs from "node:fs";

@@ -8,7 +8,13 @@ const NAMES = {
   t: ["t", "ts", "time", "times", "timestamp", "timestamps"], x: ["x", "xs"], y: ["y", "ys"],
   p: ["p", "ps", "pol", "polarity", "on"],
 };
-const column = (name) => Object.keys(NAMES).find((key) => NAMES[key].includes(name)) ?? "";
+const UNITS = { // microseconds in a unit: its names
+  1e6: ["s", "sec", "secs", "second", "seconds"], 1e3: ["ms", "msec", "millisecond", "milliseconds"],
+  1: ["us", "usec", "µs", "μs", "microsecond", "microseconds"],
+  1e-3: ["ns", "nsec", "nanosecond", "nanoseconds"],
+};
+const keyOf = (names, name) => Object.keys(names).find((key) => names[key].includes(name)) ?? "";
+const column = (name) => keyOf(NAMES, name);
 
 // ---- files
 
@@ -107,30 +113,46 @@ function fromColumns(columns, name) {
   return checked({ t, x: columns.x.data, y: columns.y.data, p: columns.p.data, width, height }, name);
 }
 
+const words = (line) => line.trim().split(/\s*,\s*|[\s;]+/);
+
+/** A line of names -> [places of t, x, y and p, number of columns, microseconds in the unit of the
+ * times or 0]; the unit as in `time [ns]` or `t_us`, of several such the finest. */
+function namesOf(line) {
+  const bare = line.slice(0, 1000).toLowerCase().replace(/^[#%\s]+|"/g, "");
+  const named = words(bare.replace(/\s*[\[(]\s*([^\s,\[\]()]*)[^\[\]()]*[\])]/g, "|$1"));
+  const keys = named.map((word) => column(word.split("|")[0]));
+  const unit = (word) => Number(keyOf(UNITS, word.split(/[|_]/)[1]));
+  if (!keys.includes("t")) {
+    const times = named.filter((word) => column(word.split("_")[0]) === "t" && unit(word));
+    const finest = times.sort((a, b) => unit(a) - unit(b))[0];
+    if (finest) keys[named.indexOf(finest)] = "t";
+  }
+  const order = [..."txyp"].map((key) => keys.indexOf(key));
+  return [order, named.length, unit(named[order[0]] ?? "")];
+}
+
 /** Lines `t x y p`, perhaps after a line `width height` or one of names. Times with a decimal point
- * or an exponent are seconds. */
+ * or an exponent are seconds, where no name tells a unit. */
 function fromText(bytes, name) {
   const lines = new TextDecoder().decode(bytes).split("\n");
-  const words = (line) => line.trim().split(/\s*,\s*|[\s;]+/);
   const number = (word) => { // False and True are 0 and 1
     const value = Number(word || NaN);
     return Number.isNaN(value) && /^(false|true)$/i.test(word) ? Number(word.length === 4) : value;
   };
-  let [first, width, height, order, columns, geometry] = [0, 0, 0, [0, 1, 2, 3], 4];
+  let [first, width, height, order, columns, unit, geometry] = [0, 0, 0, [0, 1, 2, 3], 4, 0];
   for (; first < lines.length; first++) {
     const found = words(lines[first]);
-    const named = words(lines[first].replace(/^[#%\s]+/, "")).map((word) => column(word.toLowerCase()));
+    const named = namesOf(lines[first]);
     if (found.length === 2 && found.every((word) => /^\d+$/.test(word))) [width, height] = found.map(Number);
     else if ((geometry = /^%geometry:(\d+),(\d+)/.exec(lines[first].trim()))) { // Metavision's own order
       [width, height, order] = [Number(geometry[1]), Number(geometry[2]), [3, 0, 1, 2]];
-    } else if ([..."txyp"].every((key) => named.includes(key))) {
-      order = [..."txyp"].map((key) => named.indexOf(key));
-      columns = named.length;
-    } else if (/^[#%]|^$/.test(found[0])) continue;
+    } else if (!named[0].includes(-1)) [order, columns, unit] = named;
+    else if (/^[#%]|^$/.test(found[0])) continue;
     else if (found.length >= 4 && !Number.isNaN(number(found[0]))) break;
     else throw new Error(`${name}, line ${first + 1}: expected t x y p, found ${found.slice(0, 6)}`);
   }
   const seconds = lines.slice(first, first + 1000).some((line) => /[.e]/i.test(words(line)[order[0]] ?? ""));
+  unit ||= seconds ? 1e6 : 1;
   const rows = lines.length - first;
   const made = { t: new Float64Array(rows), x: new Float64Array(rows), y: new Float64Array(rows), p: new Float64Array(rows) };
   let count = 0;
@@ -140,7 +162,7 @@ function fromText(bytes, name) {
     const [t, x, y, p] = order.map((k) => number(found[k]));
     if (found.length !== columns || Number.isNaN(t + x + y + p))
       throw new Error(`${name}, line ${n + 1}: expected t x y p, found ${found.slice(0, 6)}`);
-    made.t[count] = Math.round(seconds ? t * 1e6 : t);
+    made.t[count] = unit < 1 ? Math.floor(t / 1000) : Math.round(t * unit);
     [made.x[count], made.y[count], made.p[count++]] = [x, y, p];
   }
   for (const key of "txyp") made[key] = made[key].subarray(0, count);
