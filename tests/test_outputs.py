@@ -1,5 +1,6 @@
 """Images and pictures in other files, read back by the libraries of these formats."""
 
+import errno
 import json
 import os
 import sqlite3
@@ -179,6 +180,34 @@ def test_a_full_disk_leaves_no_bag_of_ros_2(tmp_path, monkeypatch, place):
         write(writer, pictures())
     writer.abandon()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_that_is_full_at_the_very_end_leaves_the_bag_before(tmp_path, monkeypatch):
+    """The bag's own list of its files is written last."""
+    pytest.importorskip("rosbags")
+
+    def write_bag():
+        writer = BagWriter(tmp_path / "images.ros2", "/image", "cam0")
+        try:
+            write(writer, pictures())
+        except OutputError:
+            writer.abandon()
+            raise
+
+    def full(self, *args, **kwargs):
+        if self.name == "metadata.yaml" and args == ("w",):
+            original(self, "w").close()
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return original(self, *args, **kwargs)
+
+    write_bag()
+    before = {path.name: path.read_bytes() for path in (tmp_path / "images.ros2").iterdir()}
+    original = Path.open
+    monkeypatch.setattr(Path, "open", full)
+    with pytest.raises(OutputError, match="No space left"):
+        write_bag()
+    after = {path.name: path.read_bytes() for path in (tmp_path / "images.ros2").iterdir()}
+    assert after == before and [path.name for path in tmp_path.iterdir()] == ["images.ros2"]
 
 
 def test_what_a_bag_cannot_say(tmp_path):

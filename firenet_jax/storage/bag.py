@@ -96,10 +96,10 @@ class BagWriter:
     def finish(self) -> None:
         with _writing(self.path):
             self.bag.close()
+            if self.ros2:  # the database in it is named after the partial folder
+                _rename_inside(self.partial, self.path.name)
             _remove(self.path, self.path)
             self.partial.rename(self.path)
-            if self.ros2:  # the database in it is still named after the partial folder
-                _rename_inside(self.path, self.partial.name)
             self.holding.close()
 
     def abandon(self) -> None:
@@ -148,14 +148,14 @@ def strange_in(folder: Path) -> str | None:
     return min((e.name for e in folder.iterdir() if not OURS.fullmatch(e.name)), default=None)
 
 
-def _rename_inside(folder: Path, old: str) -> None:
-    """Renames the database, and in metadata.yaml: rosbags named it `images.partial.ros2.db3`."""
-    metadata, name = folder / "metadata.yaml", f"{folder.name}.db3"
+def _rename_inside(folder: Path, bag_name: str) -> None:
+    """Names the database after the bag, in metadata.yaml too: rosbags named it after the folder."""
+    metadata, name = folder / "metadata.yaml", f"{bag_name}.db3"
     yaml: Any = importlib.import_module("ruamel.yaml").YAML(typ="safe")  # comes with rosbags
     yaml.default_flow_style, yaml.width = False, 2**20  # else a long name may span lines
     told = yaml.load(metadata.read_text(encoding="utf-8"))
     bag = told["rosbag2_bagfile_information"]
     bag["relative_file_paths"], bag["files"][0]["path"] = [name], name
-    (folder / f"{old}.db3").rename(folder / name)
+    (folder / f"{folder.name}.db3").rename(folder / name)
     with metadata.open("w", encoding="utf-8") as file:
         yaml.dump(told, file)
