@@ -142,6 +142,9 @@ def test_times_outside_of_a_recording(tmp_path, weights, caplog):  # noqa: F811
         ({"times": Times(), "names": "nanoseconds"}, "where it is chosen"),
         ({"topic": "a b"}, "topic is"),
         ({"preview": True, "output": "a.h5"}, "as the network gives them"),
+        ({"display": Display(bilateral=25), "output": "a.h5"}, "as the network gives them"),
+        ({"display": Display(range="fixed"), "output": "a.h5"}, "as the network gives them"),
+        ({"names": "nanoseconds", "output": "a.mp4"}, "holds no png files"),
     ],
 )
 def test_impossible_settings(tmp_path, weights, choice, said):  # noqa: F811

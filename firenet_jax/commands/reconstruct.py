@@ -148,9 +148,13 @@ class Reconstruct:
                 "pictures are named by their time where it is chosen: with --rate, --at, "
                 "--between-frames or --triggers"
             )
-        if self.output.suffix == ".h5" and (self.preview or self.network.color):
+        if self.names == "nanoseconds" and self.output.suffix in video.WHOLE:
+            raise SettingsError(f"{self.output} holds no png files to name: leave out --names")
+        shown = self.preview or self.network.color or self.display != Display()
+        if self.output.suffix == ".h5" and shown:
             raise SettingsError(
-                ".h5 holds images as the network gives them: leave out --preview and --color"
+                ".h5 holds images as the network gives them: leave out --preview, --color, "
+                "--unsharp, --range and --bilateral"
             )
 
 
