@@ -3,6 +3,7 @@ import sys
 from pathlib import Path
 
 import av
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
@@ -273,6 +274,17 @@ def test_a_rate_need_not_be_whole(tmp_path, fps):
     write_video(tmp_path / "a.mp4", ramp(), fps=fps)
     with av.open(str(tmp_path / "a.mp4")) as container:
         assert float(container.streams.video[0].average_rate) == pytest.approx(fps, rel=1e-4)
+
+
+def test_a_rate_may_be_a_number_of_numpy_or_jax(tmp_path):
+    """As where it is computed from times; in float32 times would lose microseconds."""
+    pictures = np.zeros((60, 2, 2), np.uint8)
+    write_video(tmp_path / "expected", pictures, fps=3)
+    for rate in (np.float32(3), jnp.float32(3)):
+        write_video(tmp_path / "a.gif", pictures[:2], fps=rate)
+        write_video(tmp_path / "found", pictures, fps=rate)
+        times = [(tmp_path / name / "timestamps.txt").read_text() for name in ("found", "expected")]
+        assert times[0] == times[1]
 
 
 def test_pictures_without_events_have_the_times_of_their_rate(tmp_path):

@@ -397,7 +397,7 @@ def write_video(path: str | Path, pictures: Iterable[np.ndarray], fps: float = 3
     Raises OutputError for another suffix or a name that cannot be written, ValueError for no
     pictures, and for one of another kind or of another size than the first.
     """
-    path = followed(Path(path))
+    path, fps = followed(Path(path)), float(fps)  # of numpy's or JAX's float32, too
     check_output(path, overwrite=True)
     writer, shape = open_writer(path, fps), None
     try:
