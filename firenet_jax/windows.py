@@ -73,6 +73,12 @@ class Windows:
                 raise SettingsError(f"step is {self.step}, but counts events: pass a whole number")
             if self.duration is not None and round(self.step * 1000) < 1:
                 raise SettingsError(f"step is {self.step} ms, but times are whole microseconds")
+            window = self.duration or self.events
+            if window is not None and self.step > window:
+                unit = "ms" if self.duration else "events"
+                raise SettingsError(
+                    f"step of {self.step:g} {unit} is longer than the window, {window:g} {unit}"
+                )
         if self.longest is not None:
             if self.duration is not None or self.frame_to_frame or self.step is not None:
                 raise SettingsError("longest limits windows of events, which do not overlap")
@@ -131,7 +137,7 @@ def cut(
     begin: microseconds, where the first window in time begins; None: at the first event.
     Raises RecordingError if windows between frames are requested and the recording has no frames,
     and, for windows in time, if no event comes for more than an hour; SettingsError if the step is
-    longer than the window.
+    longer than the window of this sensor.
     """
     chunks = iter(recording.events() if chunks is None else chunks)
     if windows.frame_to_frame:
@@ -145,10 +151,6 @@ def cut(
         return _by_time(recording.path, chunks, begin, spans)
     if windows.duration is not None:
         step = windows.duration if windows.step is None else windows.step
-        if step > windows.duration:
-            raise SettingsError(
-                f"step of {step} ms is longer than the window, {windows.duration} ms"
-            )
         spans = partial(_grid_spans, windows.duration, step)
         return _by_time(recording.path, chunks, begin, spans)
     count = windows.count(recording.pixels)

@@ -311,6 +311,25 @@ def test_a_recording_that_cannot_be_opened_does_not_keep_others_from_being_done(
     assert not (tmp_path / "other").exists() or not list((tmp_path / "other").iterdir())
 
 
+@pytest.mark.parametrize(
+    "choice, said",
+    [
+        ({"windows": Windows(step=100)}, "odd.txt: step of 100 events is longer than the window"),
+        ({"network": Network(color=True)}, "odd.txt: 9x7 cannot be a colour sensor"),
+    ],
+)
+def test_settings_that_do_not_suit_one_sensor_name_the_recording(tmp_path, weights, choice, said):
+    """And do not keep others from being done."""
+    paths = tuple(tmp_path / f"{name}.txt" for name in ("fine", "odd", "other"))
+    for path, (width, height) in zip(paths, ((24, 20), (9, 7), (26, 20)), strict=True):
+        write_recording(path, 400, width=width, height=height)
+    with pytest.raises(RecordingError, match=f"{said}.*the other recordings are done"):
+        run(settings(weights, paths, tmp_path / "all", **choice))
+    assert {path.name for path in (tmp_path / "all").iterdir() if path.is_dir()} == {
+        "fine", "other"
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize("batch", [1, 2])
 def test_a_damaged_recording_does_not_keep_others_from_being_done(
     tmp_path, weights, batch, monkeypatch

@@ -24,7 +24,7 @@ import numpy as np
 from tqdm import tqdm
 
 from firenet_jax.devices import BATCH, REPLICATED, device_mesh, sharding
-from firenet_jax.errors import RecordingError, logger
+from firenet_jax.errors import RecordingError, SettingsError, logger
 from firenet_jax.events import Events, Recording, counted
 from firenet_jax.instants import Counts, Grid, Step, steps, warming
 from firenet_jax.network import Weights
@@ -287,8 +287,10 @@ def start(job: Job, way: Way, opened: dict[Path, Writer]) -> tuple[Running, Sess
                 f"{job.recording.path}: no events, or none that the filters let pass"
                 + lasting(job.recording)
             )
-    except RecordingError:
+    except (RecordingError, SettingsError) as error:
         opened.pop(job.output).abandon()
+        if isinstance(error, SettingsError):  # of the sensor's size
+            raise RecordingError(f"{job.recording.path}: {error}") from error
         raise
     if running.reached and isinstance(writer, FolderWriter):
         writer.keep(running.pictures)
@@ -340,11 +342,12 @@ def computed(
     height, width = recording.height, recording.width
     mesh = device_mesh(jax.local_devices()[:devices]) if devices > 1 else None
     weights = jax.device_put(weights, sharding(REPLICATED, mesh) if mesh else None)
-    session = initial_session(slots, height, width, way.network, way.at_times)
+    session = None
     sent = deque()
     in_flight = 1 if jax.default_backend() == "cpu" else 2
     kept = time.monotonic()
-    for chunk in chunks:
+    for chunk in chunks:  # there may be none, of a sensor that does not suit the settings
+        session = session or initial_session(slots, height, width, way.network, way.at_times)
         for slot, state in chunk.starts.items():
             session = _set_slot(session, slot, state)
         events = chunk.events
