@@ -242,6 +242,16 @@ def test_a_page_in_the_folder_that_one_is_in(tmp_path, capsys, monkeypatch, runt
     assert code == 1 and "exists" in error
 
 
+def test_a_folder_beside_a_page_stays(tmp_path, capsys, runtime):
+    """Its name is that under which other outputs are made."""
+    (tmp_path / "page.partial").mkdir()
+    (tmp_path / "page.partial" / "thesis.txt").write_text("of two years")
+    before = {path.name for path in tmp_path.iterdir()}
+    assert firenet(capsys, "export --web page --sample a.txt")[0] == 0
+    assert (tmp_path / "page.partial" / "thesis.txt").read_text() == "of two years"
+    assert {path.name for path in tmp_path.iterdir()} == before | {"page"}
+
+
 def test_a_page_that_cannot_be_is_one_sentence(tmp_path, capsys, runtime):
     events, pictures = Events.empty(), [Picture(0, np.zeros((8, 8), np.uint8), None)]
     write_sequence(tmp_path / "silent.h5", [events], pictures, height=8, width=8)

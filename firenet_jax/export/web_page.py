@@ -12,6 +12,7 @@ import importlib.resources
 import json
 import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from firenet_jax.events import Events
 from firenet_jax.export.onnx_model import onnx_model
 from firenet_jax.network import Weights
-from firenet_jax.storage.files import OutputError, named, partial_name, writing
+from firenet_jax.storage.files import OutputError, named, writing
 
 RUNTIME = "onnxruntime-web"
 # Both ways to run: on a GPU, and where there is none.
@@ -54,10 +55,13 @@ def write_page(folder: Path, weights: Weights, sample: Events, height: int, widt
     """Writes the folder. Raises OutputError where onnx or the runtime is missing, or no room."""
     runtime_version(runtime)
     model = onnx_model(weights, picture=True).SerializeToString()
-    beside = partial_name(named(folder))
+    final = named(folder)
     with writing(folder):
-        shutil.rmtree(beside, ignore_errors=True)
-        (beside / "ort").mkdir(parents=True)
+        final.parent.mkdir(parents=True, exist_ok=True)
+    prefix = f"{final.name}.partial."
+    with writing(folder), TemporaryDirectory(prefix=prefix, dir=final.parent) as made:
+        beside = Path(made)
+        (beside / "ort").mkdir()
         for page in importlib.resources.files("firenet_jax.export").joinpath("page").iterdir():
             (beside / page.name).write_bytes(page.read_bytes())
         (beside / "firenet.onnx").write_bytes(model)
@@ -69,4 +73,3 @@ def write_page(folder: Path, weights: Weights, sample: Events, height: int, widt
             place = folder / path.relative_to(beside)  # what else lies in the folder stays
             place.parent.mkdir(parents=True, exist_ok=True)
             path.replace(place)
-        shutil.rmtree(beside)
