@@ -165,11 +165,29 @@ def _infer_size(path: Path, events: Iterator[Events]) -> tuple[int, int]:
     return height, width
 
 
-def in_chunks(read: Callable[[slice], Events | Rows], count: int) -> Iterator[Events | Rows]:
-    """Yields what `read` makes of each slice of up to CHUNK rows, from 0 to `count`: for formats
-    with random access."""
+def in_chunks(
+    path: Path, columns: Callable[[slice], Iterable], count: int
+) -> Iterator[Events | Rows]:
+    """columns: rows -> t, x, y, p of these; count: of all rows. For formats with random access."""
     for start in range(0, count, CHUNK):
-        yield read(slice(start, min(start + CHUNK, count)))
+        yield to_events(path, start, *columns(slice(start, min(start + CHUNK, count))))
+
+
+def to_chunks(
+    path: Path, pieces: Iterable[Iterable], left: int = 0, whole: str = "an event"
+) -> Iterator[Events | Rows]:
+    """Pieces of t, x, y, p, one after the other -> a chunk each.
+
+    left: bytes of one that is not `whole`, at the end; if there are any, RecordingError says so."""
+    row = 0
+    for columns in pieces:
+        events = to_events(path, row, *columns)
+        row += len(events)
+        yield events
+    if left:
+        raise RecordingError(
+            f"{path}: ends within {whole}: the file is cut off: copy or download it again"
+        )
 
 
 def joined(chunks: Iterable[Events | Rows], least: int = CHUNK // 4) -> Iterator[Events | Rows]:

@@ -19,6 +19,7 @@ holds them. The files do not tell rising edges from falling ones.
 """
 
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -26,8 +27,8 @@ from typing import NamedTuple
 import numpy as np
 
 from firenet_jax.errors import RecordingError, logger
-from firenet_jax.events import Events, Frames, Rows, Triggers
-from firenet_jax.readers import CHUNK, Source, aedat, all_triggers, joined, to_events, unwrap
+from firenet_jax.events import Frames
+from firenet_jax.readers import CHUNK, Source, aedat, all_triggers, joined, to_chunks, unwrap
 
 PICTURE, IMU, EXPOSED = 1 << 31, 1 << 11, 1 << 10  # bits of a DAVIS
 LEVEL = 0x3FF
@@ -85,11 +86,11 @@ def read(path: Path, size: tuple[int, int] | None = None) -> Source:
     frames = _frames(file) if file.layout.pictures else None
     return Source(
         "AEDAT-2.0",
-        lambda: joined(_events(file)),
+        lambda: joined(to_chunks(path, _columns(file), (path.stat().st_size - file.begin) % 8)),
         file.size,
         frames=frames,
         grey=file.grey,
-        triggers=lambda: _triggers(file),
+        triggers=lambda: all_triggers(_triggers(file)),
     )
 
 
@@ -151,14 +152,13 @@ def _inferred(
 
 
 def _records(
-    path: Path, begin: int, first: int = 0, count: int | None = None
+    path: Path, begin: int, first: int = 0, count: int = sys.maxsize
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """(number of the first, addresses uint32, times int64), from the record `first` on."""
     with open(path, "rb") as file:
         file.seek(begin + 8 * first)
         last, number = 0, first
-        end = None if count is None else first + count
-        while data := file.read(8 * (CHUNK if end is None else min(CHUNK, end - number))):
+        while data := file.read(8 * min(CHUNK, first + count - number)):
             address, time = np.frombuffer(data[: len(data) // 8 * 8], ">u4").reshape(-1, 2).T
             if not len(address):
                 return
@@ -177,29 +177,19 @@ def _kinds(file: File, address: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return ~edges, edges
 
 
-def _events(file: File) -> Iterator[Events | Rows]:
-    row, (height, width), layout = 0, file.size, file.layout
-    left = (file.path.stat().st_size - file.begin) % 8
+def _columns(file: File) -> Iterator[tuple[np.ndarray, ...]]:
+    (height, width), layout = file.size, file.layout
     for _, address, time in _records(file.path, file.begin):
         is_event, _ = _kinds(file, address)
         address = address[is_event]
         x, y = width - 1 - layout.column(address), height - 1 - layout.row(address)
-        on = (address >> layout.polarity & 1) == layout.brighter
-        yield to_events(file.path, row, time[is_event], x, y, on)
-        row += len(address)
-    if left:
-        raise RecordingError(
-            f"{file.path}: ends within an event: the file is cut off: copy or download it again"
-        )
+        yield time[is_event], x, y, (address >> layout.polarity & 1) == layout.brighter
 
 
-def _triggers(file: File) -> Triggers | None:
-    def pieces():
-        for _, address, time in _records(file.path, file.begin):
-            time = time[_kinds(file, address)[1]]
-            yield time, np.zeros_like(time), np.ones_like(time)
-
-    return all_triggers(pieces())
+def _triggers(file: File) -> Iterator[tuple[np.ndarray, ...]]:
+    for _, address, time in _records(file.path, file.begin):
+        time = time[_kinds(file, address)[1]]
+        yield time, np.zeros_like(time), np.ones_like(time)
 
 
 # ---- Pictures: a scan of all pixels after their reset, one after their exposure
@@ -251,13 +241,11 @@ def _scans(
     height, width = file.size
     starts = (jumps[:, 0] > width // 2) & (jumps[:, 1] > height // 2)
     starts[0] |= before is None
-    edges = [0, *np.flatnonzero(starts).tolist(), len(of_kind)]
     pieces: list[Scan | None] = []
-    for begin, end in zip(edges[:-1], edges[1:], strict=True):
-        if begin == end:
+    for rows in np.split(of_kind, np.flatnonzero(starts)):
+        if not len(rows):  # the first
             pieces.append(None)
             continue
-        rows = of_kind[begin:end]
         t = time[rows]
         facts = number + rows[0], number + rows[-1], len(rows), t[0], t[-1], (t - t[0]).sum()
         pieces.append(Scan(*map(int, facts)))

@@ -16,6 +16,7 @@ events is read. Frames of parts of the sensor are skipped.
 """
 
 import re
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -23,16 +24,11 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from firenet_jax.errors import RecordingError, logger
-from firenet_jax.events import Events, Frames, Rows, Triggers
-from firenet_jax.readers import Source, aedat, all_triggers, joined, reading, to_events, to_frame
+from firenet_jax.events import Frames
+from firenet_jax.readers import Source, aedat, all_triggers, joined, reading, to_chunks, to_frame
 
 SPECIAL, POLARITY, FRAME = 0, 1, 2
-HEAD = np.dtype(
-    [
-        ("kind", "<i2"), ("source", "<i2"), ("size", "<i4"), ("time", "<i4"), ("wraps", "<i4"),
-        ("capacity", "<i4"), ("count", "<i4"), ("valid", "<i4"),
-    ]
-)  # fmt: skip
+HEAD = struct.Struct("<2h6i")
 EVENT = np.dtype([("data", "<u4"), ("t", "<i4")])
 FRAME_HEAD = np.dtype(
     [("info", "<u4"), ("begin", "<i4"), ("end", "<i4"), ("open", "<i4"), ("shut", "<i4"),
@@ -85,11 +81,11 @@ def read(path: Path) -> Source:
     name = re.search(rf"^#Source {layout.source}: *(.+)$", header, re.M)
     return Source(
         "AEDAT-3.1",
-        lambda: joined(_events(layout)),
+        lambda: joined(to_chunks(path, _events(layout))),
         None if name is None else aedat.sensor_size(name[1]),
         frames=_frames(layout),
         grey=name is not None and aedat.is_grey(name[1]),
-        triggers=lambda: _triggers(layout),
+        triggers=lambda: all_triggers(_triggers(layout)),
     )
 
 
@@ -110,16 +106,14 @@ def _packets(path: Path, file: BinaryIO, begin: int) -> Iterator[Packet]:
     at, end = begin, path.stat().st_size
     while at < end:
         file.seek(at)
-        data = file.read(HEAD.itemsize)
-        head = np.frombuffer(data, HEAD)[0] if len(data) == HEAD.itemsize else None
-        size, count = (0, 0) if head is None else (int(head["size"]), int(head["count"]))
-        offset = at + HEAD.itemsize
-        if head is None or size <= 0 or count < 0 or offset + size * count > end:
+        head = file.read(HEAD.size).ljust(HEAD.size, b"\0")  # if cut off, it ends beyond `end`
+        kind, source, size, _, wraps, _, count, _ = HEAD.unpack(head)
+        offset = at + HEAD.size
+        if size <= 0 or count < 0 or offset + size * count > end:
             raise RecordingError(
                 f"{path}: cannot be read from byte {at} on, where no whole packet is: the file is "
                 "cut off or damaged: copy or download it again"
             )
-        kind, source, wraps = (int(head[name]) for name in ("kind", "source", "wraps"))
         yield Packet(kind, source, size, wraps, count, offset)
         at = offset + size * count
 
@@ -147,21 +141,16 @@ def _columns(layout: Layout, kind: int) -> Iterator[tuple[np.ndarray, np.ndarray
             yield entries["data"], entries["t"].astype(np.int64) + (packet.wraps << 31)
 
 
-def _events(layout: Layout) -> Iterator[Events | Rows]:
-    row = 0
+def _events(layout: Layout) -> Iterator[tuple[np.ndarray, ...]]:
     for data, t in _columns(layout, POLARITY):
-        yield to_events(layout.path, row, t, data >> 17, data >> 2 & 0x7FFF, data >> 1 & 1)
-        row += len(t)
+        yield t, data >> 17, data >> 2 & 0x7FFF, data >> 1 & 1
 
 
-def _triggers(layout: Layout) -> Triggers | None:
-    def pieces():
-        for data, t in _columns(layout, SPECIAL):
-            kinds = (data >> 1 & 0x7F).tolist()
-            edges = [(time, *EDGES[k]) for time, k in zip(t, kinds, strict=True) if k in EDGES]
-            yield np.array(edges, np.int64).reshape(-1, 3).T
-
-    return all_triggers(pieces())
+def _triggers(layout: Layout) -> Iterator[np.ndarray]:
+    for data, t in _columns(layout, SPECIAL):
+        kinds = (data >> 1 & 0x7F).tolist()
+        edges = [(time, *EDGES[k]) for time, k in zip(t, kinds, strict=True) if k in EDGES]
+        yield np.array(edges, np.int64).reshape(-1, 3).T
 
 
 def _frames(layout: Layout) -> Frames | None:

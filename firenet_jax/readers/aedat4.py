@@ -24,8 +24,8 @@ import numpy as np
 import pyarrow as pa
 
 from firenet_jax.errors import RecordingError
-from firenet_jax.events import Events, Frames, Rows, Triggers
-from firenet_jax.readers import Source, aedat, all_triggers, joined, reading, to_events, to_frame
+from firenet_jax.events import Frames
+from firenet_jax.readers import Source, aedat, all_triggers, joined, reading, to_chunks, to_frame
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 CODECS = {0: None, 1: "lz4", 2: "lz4", 3: "zstd", 4: "zstd"}
@@ -71,11 +71,11 @@ def read(path: Path) -> Source:
     shown_grey = frames is not None and stream is not None and _is_grey(path, layout, stream)
     return Source(
         "AEDAT4",
-        lambda: joined(_events(path, layout)),
+        lambda: joined(to_chunks(path, _events(path, layout))),
         layout.size,
         frames=frames,
         grey=layout.explorer or shown_grey,
-        triggers=lambda: _triggers(path, layout),
+        triggers=lambda: all_triggers(_triggers(path, layout), *DAMAGED),
     )
 
 
@@ -210,8 +210,7 @@ def up_to(stream, most: int) -> bytes:
     return b"".join(pieces)
 
 
-def _events(path: Path, layout: Layout) -> Iterator[Events | Rows]:
-    row = 0
+def _events(path: Path, layout: Layout) -> Iterator[tuple[np.ndarray, ...]]:
     with open(path, "rb") as file:
         for offset, size in _packets(path, file, layout, layout.events):
             with reading(path, *DAMAGED):
@@ -221,26 +220,23 @@ def _events(path: Path, layout: Layout) -> Iterator[Events | Rows]:
                     continue
                 start, count = _vector(data, start, EVENT.itemsize)
                 events = np.frombuffer(data, EVENT, count, start)
-            chunk = to_events(path, row, events["t"], events["x"], events["y"], events["on"] != 0)
-            yield chunk
-            row += len(chunk)
+            yield events["t"], events["x"], events["y"], events["on"] != 0
 
 
-def _triggers(path: Path, layout: Layout) -> Triggers | None:
-    def pieces(stream: int):
-        with open(path, "rb") as file:
-            for offset, size in _packets(path, file, layout, stream):
-                data = _unpacked(file, layout, offset, size)
-                start = _field(data, _root(data), 0, "at", NOWHERE)
-                start, count = (0, 0) if start == NOWHERE else _vector(data, start, 4)
-                edges = []
-                for at in range(start, start + 4 * count, 4):
-                    table = _root(data, at)
-                    if (kind := _field(data, table, 1, "b")) in EDGES:
-                        edges.append((_field(data, table, 0, "q"), *EDGES[kind]))
-                yield np.array(edges, np.int64).reshape(-1, 3).T
-
-    return None if layout.triggers is None else all_triggers(pieces(layout.triggers), *DAMAGED)
+def _triggers(path: Path, layout: Layout) -> Iterator[np.ndarray]:
+    if layout.triggers is None:
+        return
+    with open(path, "rb") as file:
+        for offset, size in _packets(path, file, layout, layout.triggers):
+            data = _unpacked(file, layout, offset, size)
+            start = _field(data, _root(data), 0, "at", NOWHERE)
+            start, count = (0, 0) if start == NOWHERE else _vector(data, start, 4)
+            edges = []
+            for at in range(start, start + 4 * count, 4):
+                table = _root(data, at)
+                if (kind := _field(data, table, 1, "b")) in EDGES:
+                    edges.append((_field(data, table, 0, "q"), *EDGES[kind]))
+            yield np.array(edges, np.int64).reshape(-1, 3).T
 
 
 # ---- Frames

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from firenet_jax.errors import RecordingError
-from firenet_jax.events import MAX_TIME, Events, Recording, Rows, checked
-from firenet_jax.readers import in_chunks, to_events
+from firenet_jax.events import MAX_TIME, Recording, checked
+from firenet_jax.readers import in_chunks
 from firenet_jax.readers.text import NAMES, warn_of_whole_seconds
 
 UNITS = {"s": None, "ms": 1000, "us": 1}  # in microseconds; seconds become float64
@@ -50,17 +50,15 @@ def recording(
     if unit not in (None, *UNITS):
         raise RecordingError(f"{name}: unit is {unit!r}, expected one of {', '.join(UNITS)}")
     columns["t"] = _in_unit(name, columns["t"], unit)
-    width, height, path = int(width), int(height), Path(name)
-
-    def read(rows: slice) -> Events | Rows:
-        return to_events(path, rows.start, *(column[rows] for column in columns.values()))
+    width, height, path, count = int(width), int(height), Path(name), columns["t"].size
 
     def events():
-        return checked(in_chunks(read, len(columns["t"])), path, height, width)
+        chunks = in_chunks(path, lambda rows: (column[rows] for column in columns.values()), count)
+        return checked(chunks, path, height, width)
 
     for _ in events():  # raises errors here, at the caller's arrays, not in a later loop
         pass
-    return Recording(path, "arrays", height, width, events, len(columns["t"]))
+    return Recording(path, "arrays", height, width, events, count)
 
 
 def _fields(name: str, array: np.ndarray) -> list[np.ndarray]:

@@ -17,11 +17,11 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
 from firenet_jax.errors import RecordingError
-from firenet_jax.events import Events, Rows, Triggers
 from firenet_jax.readers import (
     CHUNK,
     Source,
@@ -31,24 +31,31 @@ from firenet_jax.readers import (
     evt21,
     extra,
     joined,
-    to_events,
+    to_chunks,
 )
 from firenet_jax.readers.dat import header_size, read_header
 
 FORMATS = {".raw": "Prophesee raw", ".es": "Event Stream"}
 WORD = {"2": 4, "2.0": 4, "2.1": 8, "21": 8, "3": 2, "3.0": 2}  # EVT version: bytes of a word
-EVT3, EVT21 = np.dtype("<u2"), np.dtype("<u8")
-# of triggers, by EVT version: function, state at the beginning, type of a word
-DECODERS = {
-    "2": (evt2.triggers, -1, np.dtype("<u4")),
-    "2.1 legacy": (partial(evt21.triggers, True), -1, EVT21),
-    "2.1": (partial(evt21.triggers, False), -1, EVT21),
-    "3": (evt3.triggers, evt3.State(), EVT3),
+EVT2, EVT3, EVT21 = np.dtype("<u4"), np.dtype("<u2"), np.dtype("<u8")
+LEGACY, LITTLE = (partial(evt21.decode, legacy) for legacy in (True, False))
+# By EVT version: function, state at the beginning, type of a word, words at once.
+EVENTS = {
+    "2": (evt2.decode, -1, EVT2, CHUNK),
+    "2.1 legacy": (LEGACY, (-1, -1), EVT21, CHUNK // 32 + 1),  # of up to 32 events
+    "2.1": (LITTLE, (-1, -1), EVT21, CHUNK // 32 + 1),
+    "3": (evt3.decode, evt3.State(), EVT3, CHUNK // 12 + 1),  # of up to 12 events
+}
+TRIGGERS = {
+    "2": (evt2.triggers, -1, EVT2, CHUNK),
+    "2.1 legacy": (partial(evt21.triggers, True), -1, EVT21, CHUNK),
+    "2.1": (partial(evt21.triggers, False), -1, EVT21, CHUNK),
+    "3": (evt3.triggers, evt3.State(), EVT3, CHUNK),
 }
 LATE = 4094  # from here on faery takes the first time high of an EVT3 file for a fall from 0
 LARGEST = (2048, 2048)  # what EVT's 11 bits reach, so that faery refuses nothing
 
-Columns = tuple[np.ndarray, ...]  # t, x, y, p
+Columns = tuple[np.ndarray, ...]  # t, x, y, p; of triggers: times, ids, polarity
 
 
 def matches(path: Path) -> bool:
@@ -58,34 +65,35 @@ def matches(path: Path) -> bool:
 def read(path: Path) -> Source:
     kind = path.suffix.lower()
     faery = extra("faery", path)
-    name, cut, version, start = FORMATS[kind], False, "", 0
+    name, left, version, start = FORMATS[kind], 0, "", 0
     if kind == ".raw":
-        name, size, cut, version, start = _raw_header(path)
+        name, size, left, version, start = _raw_header(path)
     else:
         with _guarded(path):
             width, height = faery.events_stream_from_file(path).dimensions()
         size = (height, width)
 
     def columns() -> Iterator[Columns]:
-        if version.startswith("2.1"):
-            return _of_evt21(path, start, version == "2.1 legacy")
-        if version == "3" and _first_high(path, start) >= LATE:
-            return _of_evt3(path, start)
-        own = {"2": _of_evt2, "3": _of_evt3}.get(version)
-        return _of_faery(faery, path, None if own is None else partial(own, path, start))
+        own = partial(_decoded, path, start, *EVENTS[version]) if version in EVENTS else None
+        unread = version.startswith("2.1") or version == "3" and _first_high(path, start) >= LATE
+        if own is not None and unread:
+            return own()
+        return _of_faery(faery, path, own)
 
     return Source(
         name,
-        lambda: joined(_events(path, columns(), cut)),
+        lambda: joined(to_chunks(path, columns(), left, "a word")),
         size,
         grey=kind == ".raw",
-        triggers=lambda: _triggers(path, version, start),
+        triggers=lambda: all_triggers(
+            _decoded(path, start, *TRIGGERS[version]) if version in TRIGGERS else ()
+        ),
     )
 
 
-def _raw_header(path: Path) -> tuple[str, tuple[int, int] | None, bool, str, int]:
-    """-> "Prophesee raw (EVT3)", (height, width) where the header states it, whether the last word
-    is cut off, a key of `DECODERS`, where words begin, bytes from the beginning of the file"""
+def _raw_header(path: Path) -> tuple[str, tuple[int, int] | None, int, str, int]:
+    """-> "Prophesee raw (EVT3)", (height, width) where the header states it, bytes of a last word
+    that is cut off, a key of `EVENTS`, where words begin, bytes from the beginning of the file"""
     with open(path, "rb") as file:
         header = read_header(file)
         start = file.tell()
@@ -95,34 +103,28 @@ def _raw_header(path: Path) -> tuple[str, tuple[int, int] | None, bool, str, int
             f"{path}: its header names no EVT version of 2.0, 2.1 or 3.0: the file is damaged or "
             "of another format"
         )
-    cut = (path.stat().st_size - start) % WORD[version[1]] > 0
+    left = (path.stat().st_size - start) % WORD[version[1]]
     known = "2.1" if WORD[version[1]] == 8 else version[1][0]
     name = f"Prophesee raw (EVT{known})"
     if known == "2.1" and evt21.is_legacy(header):
         known = "2.1 legacy"
-    return name, header_size(header), cut, known, start
+    return name, header_size(header), left, known, start
 
 
-def _triggers(path: Path, version: str, start: int) -> Triggers | None:
-    """version: a key of `DECODERS`; of any other no triggers are read."""
-    if version not in DECODERS:
-        return None
-    decode, state, kind = DECODERS[version]
-
-    def pieces():
-        now = state
-        for words in _words(path, start, kind):
-            now, edges = decode(now, words)
-            yield edges
-
-    return all_triggers(pieces())
+def _decoded(
+    path: Path, start: int, decode: Callable, state: Any, kind: np.dtype, most: int
+) -> Iterator[Columns]:
+    """What `decode` makes of the words of a file, so many at a time."""
+    for words in _words(path, start, kind, most):
+        state, columns = decode(state, words)
+        yield columns
 
 
-def _words(path: Path, start: int, kind: np.dtype, most: int | None = None) -> Iterator[np.ndarray]:
+def _words(path: Path, start: int, kind: np.dtype, most: int) -> Iterator[np.ndarray]:
     """The words of a file, so many at a time; without a last one that is cut off."""
     with open(path, "rb") as file:
         file.seek(start)
-        while data := file.read((most or CHUNK) * kind.itemsize):
+        while data := file.read(most * kind.itemsize):
             yield np.frombuffer(data, kind, len(data) // kind.itemsize)
 
 
@@ -138,17 +140,6 @@ def _guarded(path: Path):
             f"{path}: cannot be read ({' '.join(str(error).split())}): the file is damaged, "
             "incomplete or of another format: copy or download it again"
         ) from error
-
-
-def _events(path: Path, columns: Iterator[Columns], cut: bool) -> Iterator[Events | Rows]:
-    row = 0
-    for t, x, y, p in columns:
-        yield to_events(path, row, t, x, y, p)
-        row += len(t)
-    if cut:
-        raise RecordingError(
-            f"{path}: ends within a word: the file is cut off: copy or download it again"
-        )
 
 
 def _of_faery(
@@ -180,30 +171,8 @@ def _of_faery(
         seen, last = seen + len(packet), int(packet["t"][-1])
 
 
-def _of_evt2(path: Path, start: int) -> Iterator[Columns]:
-    high = -1
-    for words in _words(path, start, np.dtype("<u4")):
-        high, columns = evt2.decode(high, words)
-        yield columns
-
-
-def _of_evt21(path: Path, start: int, legacy: bool) -> Iterator[Columns]:
-    high, latest = -1, -1
-    for words in _words(path, start, EVT21, CHUNK // 32 + 1):  # of up to 32 events
-        high, (t, x, y, p) = evt21.decode(legacy, high, words)
-        latest, t = evt3.without_jitter(latest, t)
-        yield t, x, y, p
-
-
-def _of_evt3(path: Path, start: int) -> Iterator[Columns]:
-    state = evt3.State()
-    for words in _words(path, start, EVT3, CHUNK // 12 + 1):  # of up to 12 events
-        state, columns = evt3.decode(state, words)
-        yield columns
-
-
 def _first_high(path: Path, start: int) -> int:
     """The first time high of an EVT3 file, 0 where none is among its first words."""
-    words = next(_words(path, start, EVT3), np.zeros(0, EVT3))
+    words = next(_words(path, start, EVT3, CHUNK), np.zeros(0, EVT3))
     highs = words[words >> 12 == 0x8]
     return int(highs[0]) & 0xFFF if len(highs) else 0

@@ -17,8 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from firenet_jax.errors import RecordingError
-from firenet_jax.events import Events, Rows
-from firenet_jax.readers import CHUNK, Source, to_events, unwrap
+from firenet_jax.readers import CHUNK, Source, to_chunks, unwrap
 
 TYPES = (0x00, 0x0C)
 VERSIONS = {0: (9, 8), 1: (9, 8), 2: (14, 14)}  # bits of x, and of y
@@ -47,7 +46,11 @@ def read(path: Path) -> Source:
     count, left = divmod(path.stat().st_size - start, 8)
     size, bits = header_size(header), VERSIONS[version]
     return Source(
-        "Prophesee DAT", lambda: _events(path, start, count, bits, left), size, count, grey=True
+        "Prophesee DAT",
+        lambda: to_chunks(path, _columns(path, start, count, *bits), left),
+        size,
+        count,
+        grey=True,
     )
 
 
@@ -76,11 +79,8 @@ def header_size(header: str) -> tuple[int, int] | None:
     return (int(height[1]), int(width[1])) if height and width else None
 
 
-def _events(
-    path: Path, start: int, count: int, bits: tuple[int, int], left: int
-) -> Iterator[Events | Rows]:
-    """bits: of x, and of y; left: bytes of an event that is not whole, at the end"""
-    row, last, (x_bits, y_bits) = 0, 0, bits
+def _columns(path: Path, start: int, count: int, x_bits: int, y_bits: int) -> Iterator[tuple]:
+    row, last = 0, 0
     with open(path, "rb") as file:
         file.seek(start)
         # Not to the end: a file that is still being written may end within an event by now.
@@ -90,9 +90,5 @@ def _events(
             x = fields & ((1 << x_bits) - 1)
             y = fields >> x_bits & ((1 << y_bits) - 1)
             p = fields >> (x_bits + y_bits) & 1
-            yield to_events(path, row, t, x, y, p)
+            yield t, x, y, p
             row, last = row + len(t), int(t[-1])
-    if left:
-        raise RecordingError(
-            f"{path}: ends within an event: the file is cut off: copy or download it again"
-        )

@@ -80,19 +80,17 @@ def _frames(path: Path) -> Frames | None:
             times.append(float(time))
         except ValueError:
             times.append(math.nan)
+        wrong = ""
         if not math.isfinite(times[-1]):
-            raise RecordingError(
-                f"{path}, images.txt, line {number}: {line.strip()!r} where a time in seconds "
-                "and the name of a picture are expected"
+            wrong = (
+                f"{line.strip()!r} where a time in seconds and the name of a picture are expected"
             )
-        if PurePath(name).is_absolute() or ".." in PurePath(name).parts:
-            raise RecordingError(
-                f"{path}, images.txt, line {number}: {name!r} lies outside the recording"
-            )
-        if "\0" in name:
-            raise RecordingError(
-                f"{path}, images.txt, line {number}: {name!r} is no name of a file"
-            )
+        elif PurePath(name).is_absolute() or ".." in PurePath(name).parts:
+            wrong = f"{name!r} lies outside the recording"
+        elif "\0" in name:
+            wrong = f"{name!r} is no name of a file"
+        if wrong:
+            raise RecordingError(f"{path}, images.txt, line {number}: {wrong}")
         names.append(name)
     if not names:
         return None

@@ -10,7 +10,7 @@ import re
 
 import numpy as np
 
-from firenet_jax.readers import evt2
+from firenet_jax.readers import evt2, evt3
 
 
 def is_legacy(header: str) -> bool:
@@ -18,15 +18,19 @@ def is_legacy(header: str) -> bool:
     return re.search(r"endianness[ =]little", header) is None
 
 
-def decode(legacy: bool, high: int, words: np.ndarray) -> tuple[int, tuple[np.ndarray, ...]]:
-    """As `evt2.decode`, of (N,) uint64."""
+def decode(
+    legacy: bool, state: tuple[int, int], words: np.ndarray
+) -> tuple[tuple[int, int], tuple[np.ndarray, ...]]:
+    """As `evt2.decode`, of (N,) uint64. state: that of `evt2`, and the latest time."""
+    high, latest = state
     heads, pixels = _halves(legacy, words)
     high, columns = evt2.decode(high, heads)
     pixels = pixels[heads >> 28 < 2]
     pixels = pixels[len(pixels) - len(columns[0]) :]  # without those before the first time high
     event, bit = np.nonzero(pixels[:, None] >> np.arange(32, dtype=np.uint32) & 1)
     t, x, y, p = (column[event] for column in columns)
-    return high, (t, x + bit, y, p)
+    latest, t = evt3.without_jitter(latest, t)
+    return (high, latest), (t, x + bit, y, p)
 
 
 def triggers(legacy: bool, high: int, words: np.ndarray) -> tuple[int, tuple[np.ndarray, ...]]:

@@ -24,10 +24,8 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Frames, Rows
-from firenet_jax.readers import Source, extra, frame_times, in_chunks, reading, to_events, to_frame
+from firenet_jax.readers import Source, extra, frame_times, in_chunks, reading, to_frame
 from firenet_jax.storage.files import check_readable
-
-Read = Callable[[slice], Events | Rows]
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 COLUMNS = {"event_cnn_minimal": ("ts", "xs", "ys", "ps"), "DSEC": ("t", "x", "y", "p")}
@@ -48,7 +46,7 @@ def matches(path: Path) -> bool:
 def read(path: Path) -> Source:
     with opened(path) as file:
         layout = _layout(path, file)
-        _, count = _reader(path, file, layout)
+        _, count = _columns(path, file, layout)
         frames = _frames(path, file, layout)
         size = file.attrs.get("sensor_resolution")
         if size is not None:
@@ -99,8 +97,8 @@ def _layout(path: Path, file: Any) -> str:
     )
 
 
-def _reader(path: Path, file: Any, layout: str) -> tuple[Read, int]:
-    """(rows -> Events, number of rows)"""
+def _columns(path: Path, file: Any, layout: str) -> tuple[Callable[[slice], Iterable], int]:
+    """(rows -> t, x, y, p, number of rows)"""
     if layout in ("MVSEC", "v2e"):
         events = file[f"{MVSEC}/events" if layout == "MVSEC" else "events"]
         check_stored(path, events)
@@ -109,7 +107,7 @@ def _reader(path: Path, file: Any, layout: str) -> tuple[Read, int]:
                 f"{path}: {events.name.strip('/')} has the shape {events.shape}, expected (N, 4)"
             )
         order = [2, 0, 1, 3] if layout == "MVSEC" else [0, 1, 2, 3]
-        return lambda rows: to_events(path, rows.start, *events[rows].T[order]), len(events)
+        return lambda rows: events[rows].T[order], len(events)
     if layout == "Metavision":
         events = file[METAVISION]
         check_stored(path, events)
@@ -118,12 +116,7 @@ def _reader(path: Path, file: Any, layout: str) -> tuple[Read, int]:
                 f"{path}: {METAVISION} is {events.dtype} of shape {events.shape}, expected rows "
                 "with fields x, y, p and t"
             )
-
-        def read_fields(rows: slice) -> Events | Rows:
-            part = events[rows]
-            return to_events(path, rows.start, *(part[name] for name in "txyp"))
-
-        return read_fields, len(events)
+        return lambda rows: map(events[rows].__getitem__, "txyp"), len(events)
 
     columns = [file["events"][name] for name in COLUMNS[layout]]
     for column in columns:
@@ -133,11 +126,11 @@ def _reader(path: Path, file: Any, layout: str) -> tuple[Read, int]:
         raise RecordingError(f"{path}: its columns differ in length: {found}")
     start = int(np.ravel(file["t_offset"])[0]) if "t_offset" in file and layout == "DSEC" else 0
 
-    def read(rows: slice) -> Events | Rows:
-        t, x, y, p = (column[rows] for column in columns)
+    def read(rows: slice) -> Iterable:
+        t, *others = (column[rows] for column in columns)
         if start and t.dtype.kind in "iu":
             t = t.astype(np.int64) + start
-        return to_events(path, rows.start, t, x, y, p)
+        return t, *others
 
     return read, len(columns[0])
 
@@ -165,7 +158,7 @@ def check_stored(path: Path, data: Any):
 
 def _events(path: Path, layout: str) -> Iterator[Events | Rows]:
     with opened(path) as file:
-        yield from in_chunks(*_reader(path, file, layout))
+        yield from in_chunks(path, *_columns(path, file, layout))
 
 
 def _resolution(path: Path, size: Any) -> tuple[int, int]:

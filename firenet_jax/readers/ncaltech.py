@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from firenet_jax.errors import RecordingError
-from firenet_jax.events import Events, Rows
-from firenet_jax.readers import CHUNK, Source, to_events
+from firenet_jax.readers import CHUNK, Source, to_chunks
 
 OVERFLOW_ROW = 240
 OVERFLOW = 2**13  # microseconds
@@ -29,11 +28,12 @@ def matches(path: Path) -> bool:
 
 def read(path: Path) -> Source:
     size = path.stat().st_size
-    return Source("N-Caltech101", lambda: _events(path, size), grey=True)  # an ATIS
+    # an ATIS, and so grey
+    return Source("N-Caltech101", lambda: to_chunks(path, _columns(path, size)), grey=True)
 
 
-def _events(path: Path, size: int) -> Iterator[Events | Rows]:
-    row, overflows = 0, 0
+def _columns(path: Path, size: int) -> Iterator[tuple]:
+    overflows = 0
     with open(path, "rb") as file:
         # Not to the end: a file that is still being written may end within an event by now.
         while data := file.read(min(5 * CHUNK, size - size % 5 - file.tell())):
@@ -42,10 +42,7 @@ def _events(path: Path, size: int) -> Iterator[Events | Rows]:
             is_overflow = y == OVERFLOW_ROW
             t += OVERFLOW * (overflows + np.cumsum(is_overflow))
             overflows += int(is_overflow.sum())
-            columns = (column[~is_overflow] for column in (t, x, y, high >> 7))
-            events = to_events(path, row, *columns)
-            row += len(events)
-            yield events
+            yield tuple(column[~is_overflow] for column in (t, x, y, high >> 7))
     if size % 5:
         raise RecordingError(
             f"{path}: has {size} bytes, expected a multiple of 5: the file is cut off or of "

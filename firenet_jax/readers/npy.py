@@ -25,7 +25,7 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Frames, Rows
-from firenet_jax.readers import Source, frame_times, in_chunks, reading, text, to_events, to_frame
+from firenet_jax.readers import Source, frame_times, in_chunks, reading, text, to_frame
 
 # layout: files of times, coordinates, polarities, frame times
 FILES = {
@@ -157,11 +157,7 @@ def _named(path: Path, arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
 
 def _rows(path: Path, opened: Callable[[], list[np.ndarray]]) -> Iterator[Events | Rows]:
     columns = opened()
-
-    def read(rows: slice) -> Events | Rows:
-        return to_events(path, rows.start, *(column[rows] for column in columns))
-
-    yield from in_chunks(read, len(columns[0]))
+    yield from in_chunks(path, lambda rows: (column[rows] for column in columns), len(columns[0]))
 
 
 def _frames(path: Path, layout: str) -> Frames | None:

@@ -29,7 +29,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from firenet_jax.errors import RecordingError, logger
-from firenet_jax.events import Events, Frames, Rows, Triggers
+from firenet_jax.events import Events, Frames, Rows
 from firenet_jax.readers import (
     Source,
     all_triggers,
@@ -38,7 +38,7 @@ from firenet_jax.readers import (
     joined,
     libcaer,
     reading,
-    to_events,
+    to_chunks,
     to_frame,
     torn_bag,
     torn_mcap,
@@ -79,7 +79,7 @@ def read(path: Path) -> Source:
         lambda: joined(_events(path, topic, topics[topic] in ARRAYS)),
         size,
         frames=frames,
-        triggers=lambda: None if topics[topic] in ARRAYS else _triggers(path, topic),
+        triggers=lambda: all_triggers(() if topics[topic] in ARRAYS else _triggers(path, topic)),
         grey=grey,
     )
 
@@ -213,13 +213,11 @@ def _size(message: _Message) -> tuple[int, int]:
 
 
 def _events(path: Path, topic: str, arrays: bool) -> Iterator[Events | Rows]:
-    row, ros2 = 0, not _is_ros1(path)
+    ros2 = not _is_ros1(path)
     with reading(path, Exception), _bag(path) as bag:
         messages = (_Message(raw, ros2) for raw in _placed(path, _raw(bag, topic)))
-        for columns in _array_columns(messages) if arrays else _packet_columns(path, messages):
-            events = to_events(path, row, *columns)
-            row += len(events)
-            yield events
+        columns = _array_columns(messages) if arrays else _packet_columns(path, messages)
+        yield from to_chunks(path, columns)
 
 
 def _placed(path: Path, messages: Iterator[tuple[int, bytes]]) -> Iterator[bytes]:
@@ -354,30 +352,26 @@ def _to_microseconds(nanoseconds: int) -> int:
 DECODERS = {"evt3": _evt3, "libcaer": _libcaer, "libcaer_cmp": _libcaer_cmp, "mono": _mono}
 
 
-def _triggers(path: Path, topic: str) -> Triggers | None:
+def _triggers(path: Path, topic: str) -> Iterator[tuple[np.ndarray, ...]]:
     """Edges among the words of EVT3, moved to the ROS clock as the events are."""
-
-    def pieces():
-        state, ahead, shift, waiting, found = evt3.State(), evt3.State(), None, bytearray(), []
-        with contextlib.suppress(Exception), _bag(path) as bag:  # events raise it
-            for _, raw in _raw(bag, topic):
-                packet = _packet(_Message(raw, not _is_ros1(path)))
-                if packet.encoding != "evt3":
-                    break
-                words = np.frombuffer(packet.payload, packet.words + "u2").astype(np.uint16)
-                if shift is None:
-                    state, columns = evt3.decode(state, words)
-                    shift = packet.stamp - int(columns[0][0]) if len(columns[0]) else None
-                waiting += words.tobytes()
-                if len(waiting) >= 2 * WORDS:
-                    ahead, edges = evt3.triggers(ahead, np.frombuffer(bytes(waiting), np.uint16))
-                    waiting = bytearray()
-                    found.append(edges)
-        found.append(evt3.triggers(ahead, np.frombuffer(bytes(waiting), np.uint16))[1])
-        if shift is not None:
-            yield from ((times + shift, ids, rises) for times, ids, rises in found)
-
-    return all_triggers(pieces())
+    state, ahead, shift, waiting, found = evt3.State(), evt3.State(), None, bytearray(), []
+    with contextlib.suppress(Exception), _bag(path) as bag:  # events raise it
+        for _, raw in _raw(bag, topic):
+            packet = _packet(_Message(raw, not _is_ros1(path)))
+            if packet.encoding != "evt3":
+                break
+            words = np.frombuffer(packet.payload, packet.words + "u2").astype(np.uint16)
+            if shift is None:
+                state, columns = evt3.decode(state, words)
+                shift = packet.stamp - int(columns[0][0]) if len(columns[0]) else None
+            waiting += words.tobytes()
+            if len(waiting) >= 2 * WORDS:
+                ahead, edges = evt3.triggers(ahead, np.frombuffer(bytes(waiting), np.uint16))
+                waiting = bytearray()
+                found.append(edges)
+    found.append(evt3.triggers(ahead, np.frombuffer(bytes(waiting), np.uint16))[1])
+    if shift is not None:
+        yield from ((times + shift, ids, rises) for times, ids, rises in found)
 
 
 def _frames(path: Path, bag, topic: str | None) -> Frames | None:
@@ -388,7 +382,7 @@ def _frames(path: Path, bag, topic: str | None) -> Frames | None:
         for time, raw in _raw(bag, topic):
             message = _Message(raw, ros2)
             stamps.append(message.header())
-            if not recorded and (encoding := _encoding(message)) not in CHANNELS:
+            if not recorded and (encoding := _picture_head(message)[2]) not in CHANNELS:
                 logger.warning("%s: images of %s are %s: no frames", path, topic, encoding)
                 return None
             recorded.append(time)
@@ -408,14 +402,14 @@ def _frames(path: Path, bag, topic: str | None) -> Frames | None:
     return Frames(np.array(stamps[: len(recorded)], np.int64), read) if recorded else None
 
 
-def _encoding(message: _Message) -> str:
-    _height, _width = message.number(4), message.number(4)
-    return message.text()
+def _picture_head(message: _Message) -> tuple[int, int, str]:
+    """(height, width, encoding)"""
+    return message.number(4), message.number(4), message.text()
 
 
 def _picture(path: Path, message: _Message) -> np.ndarray:
-    height, width = message.number(4), message.number(4)
-    encoding, is_big, step = message.text(), message.number(1), message.number(4)
+    height, width, encoding = _picture_head(message)
+    is_big, step = message.number(1), message.number(4)
     if encoding not in CHANNELS:
         raise RecordingError(
             f"{path}: a frame is {_in_a_line(encoding)}, expected one of {', '.join(CHANNELS)}"

@@ -14,7 +14,7 @@ Threads read ahead; events become tensors on the device.
 
 import hashlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -26,8 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.errors import RecordingError, SettingsError, logger
-from firenet_jax.events import BINS, Events, Rows, checked, concatenate, counted, event_number
-from firenet_jax.readers import CHUNK, frame_times, to_events, to_frame
+from firenet_jax.events import BINS, Events, checked, concatenate, counted, event_number
+from firenet_jax.readers import frame_times, in_chunks, to_events, to_frame
 from firenet_jax.readers.hdf5 import check_stored, in_order, opened
 from firenet_jax.settings import check_sizes
 from firenet_jax.simulation.sensor import Simulation
@@ -169,7 +169,11 @@ def _index(path: Path) -> Index:
             )
         times, rows = frame_times(path, times), np.zeros(len(names), np.int64)
         # Not the attribute event_idx: programs differ in what it counts, by one.
-        for events in checked(_stamps(path, stamps), path, None, None):
+
+        def columns(part: slice):
+            return stamps[part], *np.zeros((3, part.stop - part.start), np.int16)  # only times
+
+        for events in checked(in_chunks(path, columns, len(stamps)), path, None, None):
             rows += np.searchsorted(events.t, times)
         if len(stamps) and rows[0] == rows[-1]:  # a file without any events is of a still camera
             raise RecordingError(
@@ -178,14 +182,6 @@ def _index(path: Path) -> Index:
                 "the file out of the folder"
             )
     return Index(names, times, rows)
-
-
-def _stamps(path: Path, column: Any) -> Iterator[Events | Rows]:
-    """Events with times only."""
-    for start in range(0, len(column), CHUNK):
-        t = column[start : start + CHUNK]
-        nothing = np.zeros(len(t), np.int16)
-        yield to_events(path, start, t, nothing, nothing, nothing)
 
 
 # ---- Examples
