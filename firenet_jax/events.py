@@ -9,7 +9,7 @@ import bisect
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, overload
+from typing import NamedTuple, TypeVar, overload
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from firenet_jax.errors import RecordingError
 
 BINS = 5  # temporal bins of an event tensor (Eq. 1)
 MAX_TIME = 2**53  # microseconds, 285 years: beyond it float64 loses microseconds
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -88,9 +89,8 @@ def concatenate(chunks: Sequence[Events | Rows]) -> Events | Rows:
         return chunks[0]
     errors = [chunk.error for chunk in chunks if isinstance(chunk, Rows)]
     if errors:
-        masks = [c.bad if isinstance(c, Rows) else np.zeros(len(c), bool) for c in chunks]
         events = [c if isinstance(c, Events) else c.events for c in chunks]
-        return Rows(concatenate(events), np.concatenate(masks), errors[0])
+        return Rows(concatenate(events), np.concatenate([*map(_known, chunks)]), errors[0])
     columns = ([getattr(chunk, name) for chunk in chunks] for name in "txyp")
     return Events(*map(np.concatenate, columns))
 
@@ -181,9 +181,9 @@ def checked(
     rows, dropped, first_error = 0, 0, None
     held, before = Events.empty(), -MAX_TIME  # a chunk's end, and the last time before it
     try:
-        for chunk in _with_damage(chunks):
+        for chunk in with_damage(chunks):
             if isinstance(chunk, RecordingError):
-                yield from _unless_empty(held)
+                yield from filter(len, [held])
                 if strict or rows == dropped:
                     raise chunk
                 what = f"what comes before is read: {counted(rows - dropped, 'event')}"
@@ -200,7 +200,7 @@ def checked(
                 wrong, fewest = _fewest(held, events, bad, before)
                 count = int(wrong.sum() + fewest.sum())
                 if strict or dropped + count > MAX_BAD_SHARE * rows:
-                    yield from _unless_empty(held)
+                    yield from filter(len, [held])
                     if first:  # so that a caller who stops before the damage never meets it
                         yield events.select(slice(first))
                     dropped = 0  # the error already says it
@@ -208,33 +208,23 @@ def checked(
                 first_error, dropped = first_error or error, dropped + count
                 held = held.select(~wrong) if wrong.any() else held
                 events = events.select(~fewest)
-            ready, later = _parted(events)
-            for part in filter(len, (held, ready)):
+            end = max(len(events) - HELD, 0)
+            for part in filter(len, [held, events.select(slice(end))]):
                 before = part.t[-1]
                 yield part
-            held = later
-        yield from _unless_empty(held)
+            held = events.select(slice(end, None))
+        yield from filter(len, [held])
     finally:
         if dropped:
             say(f"{first_error}; left out: {dropped:,} of {counted(rows, 'event')}", rows)
 
 
-def _with_damage(chunks: Iterable[Events | Rows]) -> Iterator[Events | Rows | RecordingError]:
-    """The chunks, and then the error that ended them."""
+def with_damage(items: Iterable[Item]) -> Iterator[Item | RecordingError]:
+    """Chunks or windows, and then the error that ended them."""
     try:
-        yield from chunks
+        yield from items
     except RecordingError as error:
         yield error
-
-
-def _parted(events: Events) -> tuple[Events, Events]:
-    """What can be passed on, and the end that waits for what follows."""
-    place = max(len(events) - HELD, 0)
-    return events.select(slice(place)), events.select(slice(place, None))
-
-
-def _unless_empty(events: Events) -> tuple[Events, ...]:
-    return (events,) if len(events) else ()
 
 
 def _fewest(

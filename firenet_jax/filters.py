@@ -33,10 +33,8 @@ def between(chunks: Iterable[Events], start: float | None, stop: float | None) -
     first = None
     for events in chunks:
         first = events.t[0] if first is None else first
-        bounds = [first + round((start or 0) * 1e6), np.iinfo(np.int64).max]
-        if stop is not None:
-            bounds[1] = first + round(stop * 1e6)
-        a, b = np.searchsorted(events.t, bounds)
+        end = np.iinfo(np.int64).max if stop is None else first + round(stop * 1e6)
+        a, b = np.searchsorted(events.t, [first + round((start or 0) * 1e6), end])
         if b > a:
             yield events.select(slice(a, b))
         if b < len(events):

@@ -26,12 +26,12 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sized
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from firenet_jax.errors import RecordingError, SettingsError
-from firenet_jax.events import Events, Recording, concatenate
+from firenet_jax.events import Events, Recording, concatenate, with_damage
 from firenet_jax.windows import MAX_GAP, Window, Windows, cut
 
 WARM_UP = 20  # windows
@@ -162,24 +162,19 @@ def _spans(windows: Windows, cutter: Iterator[Window]) -> Iterator[tuple[Window,
     """Windows -> (window, its begin, its end): each begins where the last one ended. The last
     window ends just after its last event."""
     first = None
-    window, number, error = next(cutter, None), 0, None
-    while window is not None:
-        try:
-            following = next(cutter, None)
-        except RecordingError as damage:  # raised after the windows before it
-            following, error = None, damage
+    pairs: Any = itertools.pairwise(itertools.chain(with_damage(cutter), [None]))
+    for number, (window, following) in enumerate(pairs):
+        if isinstance(window, RecordingError):  # raised after the windows before it
+            raise window
         if windows.duration is not None:
             first = int(window.events.t[0]) if first is None else first
             begin, end = (first + round(k * _span(windows)) for k in (number, number + 1))
         else:
             begin = int(window.events.t[0])
-            end = 0 if following is None else int(following.events.t[0])
-        if following is None:
+            end = int(following.events.t[0]) if isinstance(following, Window) else 0
+        if not isinstance(following, Window):
             end = max(int(window.events.t[-1]) if len(window.events) else window.time, begin) + 1
         yield window, begin, end
-        window, number = following, number + 1
-    if error is not None:
-        raise error
 
 
 def _span(windows: Windows) -> Fraction:

@@ -225,15 +225,12 @@ def _by_time(path, chunks: Iterator[Events], begin: int | None, spans) -> Iterat
         return
     held, ended = first, False
     for start, stop in spans(int(first.t[0]) if begin is None else begin):
-        more, last = [], held.t[-1] if len(held) else None
-        while not ended and (last is None or last < stop):
+        parts = [held]
+        while not ended and not (len(parts[-1]) and parts[-1].t[-1] >= stop):
             chunk = next(chunks, None)
-            if chunk is None:
-                ended = True
-            else:
-                more.append(chunk)
-                last = chunk.t[-1]
-        held = concatenate([held, *more])
+            ended = chunk is None
+            parts += [] if chunk is None else [chunk]
+        held = concatenate(parts)
         a, b = np.searchsorted(held.t, [start, stop])
         yield _window(held, a, b, stop)
         if ended and b == len(held):
