@@ -18,7 +18,7 @@ import math
 import re
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -100,11 +100,10 @@ def opened(path: Path, member: str | None = None) -> Iterator[Any]:
             with reading(path, Exception):  # a damaged list of members raises every kind
                 archive = stack.enter_context(zipfile.ZipFile(path))
                 stream = stack.enter_context(archive.open(member))
-            yield stream
-        elif path.suffix.lower() == ".gz":
-            yield stack.enter_context(gzip.open(path))
         else:
-            yield stack.enter_context(open(path, "rb"))
+            compressed = path.suffix.lower() == ".gz"
+            stream = stack.enter_context(gzip.open(path) if compressed else open(path, "rb"))
+        yield stream
 
 
 def members(path: Path) -> list[str]:
@@ -166,19 +165,17 @@ def _sniff(path: Path, member: str | None, columns: str | None = None) -> Layout
             "the file begin with such a line"
         )
 
-    def whole(name: str) -> bool:
-        index = names.index(name)
-        return not any(set(".e") & set(row[index].lower()) for row in rows if index < len(row))
-
-    types = {name: pa.int32() if whole(name) else pa.float64() for name in ("x", "y", "p")}
+    found = {name: [row[i] for row in rows if i < len(row)] for i, name in enumerate(names)}
+    whole = {name: not any(set(".e") & set(word.lower()) for word in found[name]) for name in NAMES}
+    types = {name: pa.int32() if whole[name] else pa.float64() for name in "xyp"}
     polarity = names.index("p")
     if any(row[polarity] in LOGICAL for row in rows[:1] if polarity < len(row)):
         types["p"] = pa.bool_()
     fine = unit is None or unit <= 1  # of seconds, a whole number tells nothing of the next
-    types["t"] = pa.int64() if rows and whole("t") and fine else pa.float64()
+    types["t"] = pa.int64() if rows and whole["t"] and fine else pa.float64()
     if types["t"] == pa.int64() and unit is None:
         logger.warning("%s: times without a decimal point: read as microseconds", path)
-    elif unit is None and len(rows) == SNIFFED and _whole_seconds(rows, names.index("t")):
+    elif unit is None and len(rows) == SNIFFED and _whole(filter(_is_number, found["t"])):
         logger.warning(
             "%s: times with a decimal point: read as seconds, though whole ones; if they are "
             "microseconds, let the file begin with a line of names, such as t_us x y p", path,
@@ -239,18 +236,14 @@ def other_order(columns: np.ndarray) -> str | None:
     return ",".join("t" if time else "p" if sign else next(rest) for time, sign in named)
 
 
-def _whole_seconds(rows: list[list[str]], column: int) -> bool:
-    words = [row[column] for row in rows if column < len(row) and _is_number(row[column])]
-    return _whole([float(word) for word in words])
-
-
-def _whole(seconds: list[float]) -> bool:
-    return len(set(seconds)) > 1 and all(map(float.is_integer, seconds))
+def _whole(seconds: Iterable[float | str]) -> bool:
+    different = set(map(float, seconds))
+    return len(different) > 1 and all(map(float.is_integer, different))
 
 
 def warn_of_whole_seconds(path: Path, t: np.ndarray, remedy: str) -> None:
     """Floating times are seconds; a warning says so where the first of them are whole ones."""
-    if t.dtype.kind == "f" and _whole(t[:SNIFFED].astype(float).tolist()):
+    if t.dtype.kind == "f" and _whole(t[:SNIFFED].tolist()):
         logger.warning(
             "%s: floating times: read as seconds, though whole ones; if they are microseconds, %s",
             path, remedy,
@@ -328,17 +321,13 @@ def _events(path: Path, member: str | None, layout: Layout) -> Iterator[Events |
 
 
 def _columns(table: pa.Table, layout: Layout) -> list[np.ndarray]:
+    """t, x, y, p; times in microseconds where they are whole numbers, else in seconds."""
     t, *others = (table[name].to_numpy() for name in "txyp")
-    return [_scaled(t, layout.unit), *others]
-
-
-def _scaled(t: np.ndarray, unit: float | None) -> np.ndarray:
-    """Times in a unit -> microseconds where they are whole numbers, else seconds."""
-    if unit is None:
-        return t
-    if t.dtype.kind == "f":
-        return t * (unit / 1e6)
-    return t if unit == 1 else t // 1000
+    if layout.unit is not None and t.dtype.kind == "f":
+        t = t * (layout.unit / 1e6)
+    elif layout.unit not in (None, 1):
+        t = t // 1000
+    return [t, *others]
 
 
 def _table(block: bytes, layout: Layout) -> pa.Table:
