@@ -41,12 +41,6 @@ class Torn:
         for _ in self._messages():  # fills `known`: connections stand among the messages
             pass
 
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        pass
-
     @property
     def connections(self) -> list[Connection]:
         return list(self.known.values())
