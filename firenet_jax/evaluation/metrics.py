@@ -18,7 +18,9 @@ compiler fuses one pass into the other and recomputes it for each tap; convoluti
 take 320 to 350.
 """
 
+import functools
 import math
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Literal
 
@@ -101,38 +103,40 @@ def _compared(image: jax.Array, truth: jax.Array) -> tuple[jax.Array, jax.Array]
     return image, truth
 
 
-@jax.jit
+def _measure(function: Callable[[jax.Array, jax.Array], jax.Array]):
+    """Compiled, of an image and a truth that `_compared` has checked."""
+    checked = functools.wraps(function)(lambda image, truth: function(*_compared(image, truth)))
+    return jax.jit(checked)
+
+
+@_measure
 def mse(image: jax.Array, truth: jax.Array) -> jax.Array:
     """mean (I - G)^2."""
-    image, truth = _compared(image, truth)
     return _mean((image - truth) ** 2)
 
 
-@jax.jit
+@_measure
 def l1(image: jax.Array, truth: jax.Array) -> jax.Array:
     """mean |I - G|."""
-    image, truth = _compared(image, truth)
     return _mean(jnp.abs(image - truth))
 
 
-@jax.jit
+@_measure
 def centred(image: jax.Array, truth: jax.Array) -> jax.Array:
     """Mean absolute difference after subtracting each image's mean, as events carry no absolute
     brightness. Sees a negative.
     """
-    image, truth = _compared(image, truth)
     difference = image - truth
     return _mean(jnp.abs(difference - _mean(difference)[..., None, None]))
 
 
-@jax.jit
+@_measure
 def contrast(image: jax.Array, truth: jax.Array) -> jax.Array:
     """Difference of the standard deviations over all pixels. Blind to a negative and to positions.
 
     Distances that are minimal at the mean favour grey wherever a network is unsure; this one
     rewards as much contrast as the truth has.
     """
-    image, truth = _compared(image, truth)
     return jnp.abs(_deviation(image) - _deviation(truth))
 
 
@@ -199,7 +203,7 @@ def ms_ssim_scales(height: int, width: int) -> int:
     return sum(min(height, width) >> scale >= WINDOW for scale in range(len(SCALES)))
 
 
-@jax.jit
+@_measure
 def ms_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     """Multi-scale SSIM (Wang, Simoncelli, Bovik 2003), 0 to 1; sees a negative (it becomes 0).
 
@@ -209,7 +213,6 @@ def ms_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     finite. The gradient is 0 if one scale is anti-correlated: training that may start there needs
     another term as well.
     """
-    image, truth = _compared(image, truth)
     scales = ms_ssim_scales(*image.shape[-2:])
     if scales == 0:
         raise SettingsError(
@@ -229,7 +232,7 @@ def ms_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
 RANKED = 6  # rows and columns of the pixels with which every pixel is compared
 
 
-@jax.jit
+@_measure
 def equalised_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     """SSIM after a soft histogram equalisation of both images, -1 to 1; sees a negative.
 
@@ -238,13 +241,13 @@ def equalised_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     texture down to a contrast of about 0.03 counts as much as strong texture. It is a global,
     differentiable version of what papers measure when they equalise (`equalise`) before SSIM.
     """
-    return ssim(*(_equalised(picture) for picture in _compared(image, truth)))
+    return ssim(_equalised(image), _equalised(truth))
 
 
-@jax.jit
+@_measure
 def equalised_mse(image: jax.Array, truth: jax.Array) -> jax.Array:
     """Mean squared difference after the soft histogram equalisation of `equalised_ssim`."""
-    return mse(*(_equalised(picture) for picture in _compared(image, truth)))
+    return mse(_equalised(image), _equalised(truth))
 
 
 def _equalised(image: jax.Array) -> jax.Array:
@@ -262,7 +265,7 @@ def _power(base: jax.Array, exponent: float) -> jax.Array:
     return jnp.where(base > least, jnp.maximum(base, least) ** exponent, line)
 
 
-@jax.jit
+@_measure
 def gmsd(image: jax.Array, truth: jax.Array) -> jax.Array:
     """Gradient magnitude similarity deviation (Xue et al. 2014), 0 to 0.5.
 
@@ -271,7 +274,7 @@ def gmsd(image: jax.Array, truth: jax.Array) -> jax.Array:
     does not count. Blind to a negative and to any offset: gmsd(1 - I, I) = 0. As a deviation it is
     also blind to errors that are the same everywhere.
     """
-    image, truth = (_gradient_magnitude(_halved(picture)) for picture in _compared(image, truth))
+    image, truth = (_gradient_magnitude(_halved(picture)) for picture in (image, truth))
     constant = 170 / 255**2
     return _deviation((2 * image * truth + constant) / (image**2 + truth**2 + constant))
 
@@ -281,7 +284,7 @@ def _gradient_magnitude(image: jax.Array) -> jax.Array:
     return root(_filter(image, mean, difference) ** 2 + _filter(image, difference, mean) ** 2)
 
 
-@jax.jit
+@_measure
 def haarpsi(image: jax.Array, truth: jax.Array) -> jax.Array:
     """Haar wavelet perceptual similarity (Reisenhofer et al. 2018), 0 to 1.
 
@@ -297,7 +300,7 @@ def haarpsi(image: jax.Array, truth: jax.Array) -> jax.Array:
     halves with blocks that begin one pixel earlier.)
     """
     constant, alpha = 30 / 255**2, 4.2
-    image, truth = (_halved(picture) for picture in _compared(image, truth))
+    image, truth = _halved(image), _halved(truth)
     p, q = 0.0, 0.0
     for a, b in zip(_haar(image), _haar(truth), strict=True):  # two orientations
         similarity = sum(
@@ -337,7 +340,7 @@ NLPD_FARTHER = 0.0072  # of the first band, two to the right
 PYRAMID = (0.05, 0.25, 0.4, 0.25, 0.05)
 
 
-@jax.jit
+@_measure
 def nlpd(image: jax.Array, truth: jax.Array) -> jax.Array:
     """Normalised Laplacian pyramid distance (Laparra, Balle, Berardino, Simoncelli 2016), >= 0.
 
@@ -349,20 +352,16 @@ def nlpd(image: jax.Array, truth: jax.Array) -> jax.Array:
     image on the way down and repeats its border on the way up. For a photograph it is about 0.2 if
     blurred by 1.5 pixels, 0.5 with noise of 0.1, 1.5 for a flat image and 3 for a negative.
     """
-    image, truth = _compared(image, truth)
-    distance = jnp.float32(0)
-    for band in range(len(NLPD_BANDS)):
-        last = band == len(NLPD_BANDS) - 1
-        details = []
-        for picture in (image, truth):
-            detail, smaller = picture, picture
-            if not last:
-                smaller = _filter(picture, PYRAMID, PYRAMID, "symmetric", stride=2)
-                detail = picture - _enlarged(smaller, *picture.shape[-2:])
-            details.append((_divided(detail, band), smaller))
-        (of_image, image), (of_truth, truth) = details
-        distance += root(_mean((of_image - of_truth) ** 2))
-    return distance / len(NLPD_BANDS)
+    pairs = zip(_normalised_bands(image), _normalised_bands(truth), strict=True)
+    return sum((root(_mean((a - b) ** 2)) for a, b in pairs), jnp.float32(0)) / len(NLPD_BANDS)
+
+
+def _normalised_bands(picture: jax.Array) -> Iterator[jax.Array]:
+    for band in range(len(NLPD_BANDS) - 1):
+        smaller = _filter(picture, PYRAMID, PYRAMID, "symmetric", stride=2)
+        yield _divided(picture - _enlarged(smaller, *picture.shape[-2:]), band)
+        picture = smaller
+    yield _divided(picture, len(NLPD_BANDS) - 1)
 
 
 def _enlarged(image: jax.Array, height: int, width: int) -> jax.Array:
@@ -392,7 +391,7 @@ def _divided(detail: jax.Array, band: int) -> jax.Array:
 DETAIL_SIGMAS = (0.8, 1.6)  # pixels, of the Gaussian blurs between which lie the bands of detail
 
 
-@jax.jit
+@_measure
 def detail(image: jax.Array, truth: jax.Array) -> jax.Array:
     """Mean absolute difference between the local strengths of fine detail, >= 0.
 
@@ -404,7 +403,6 @@ def detail(image: jax.Array, truth: jax.Array) -> jax.Array:
     It measures how much detail there is, not its exact position, whereas other distances favour
     blur over misplaced detail. Blind to a negative and to offsets.
     """
-    image, truth = _compared(image, truth)
     window = _gaussian(2.5, radius=6)
 
     def bands(picture):
@@ -418,7 +416,7 @@ def detail(image: jax.Array, truth: jax.Array) -> jax.Array:
     return sum((_mean(jnp.abs(a - b)) for a, b in pairs), jnp.float32(0)) / len(DETAIL_SIGMAS)
 
 
-@jax.jit
+@_measure
 def cw_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     """Complex wavelet SSIM (Sampat et al. 2009) with Gabor filters, 0 to 1.
 
@@ -428,7 +426,6 @@ def cw_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     The original has a steerable pyramid.
     Tolerates shifts of a pixel or two. Blind to a negative and to offsets.
     """
-    image, truth = _compared(image, truth)
     scales = max(1, sum(min(image.shape[-2:]) >> scale >= 17 for scale in range(3)))
     similarity = jnp.float32(0)
     for scale in range(scales):
@@ -473,7 +470,7 @@ def _complex_similarity(a: list, b: list) -> jax.Array:
     return similarity / len(a)
 
 
-@jax.jit
+@_measure
 def random_features(image: jax.Array, truth: jax.Array) -> jax.Array:
     """Distance between the features of a fixed random network, 0 to 2; sees a negative.
 
@@ -483,7 +480,7 @@ def random_features(image: jax.Array, truth: jax.Array) -> jax.Array:
     pixels into 4 channels, the others take means. Liu et al. 2021 train with such features.
     """
     kernels = random_kernels(seed=0)
-    both = (_random_layers(kernels, picture) for picture in _compared(image, truth))
+    both = (_random_layers(kernels, picture) for picture in (image, truth))
     layers = [_mean(((a - b) ** 2).sum(-1)) for a, b in zip(*both, strict=True)]
     return sum(layers, jnp.float32(0)) / len(layers)
 

@@ -38,12 +38,11 @@ from firenet_jax.readers.dat import header_size, read_header
 FORMATS = {".raw": "Prophesee raw", ".es": "Event Stream"}
 WORD = {"2": 4, "2.0": 4, "2.1": 8, "21": 8, "3": 2, "3.0": 2}  # EVT version: bytes of a word
 EVT2, EVT3, EVT21 = np.dtype("<u4"), np.dtype("<u2"), np.dtype("<u8")
-LEGACY, LITTLE = (partial(evt21.decode, legacy) for legacy in (True, False))
 # By EVT version: function, state at the beginning, type of a word, words at once.
 EVENTS = {
     "2": (evt2.decode, -1, EVT2, CHUNK),
-    "2.1 legacy": (LEGACY, (-1, -1), EVT21, CHUNK // 32 + 1),  # of up to 32 events
-    "2.1": (LITTLE, (-1, -1), EVT21, CHUNK // 32 + 1),
+    "2.1 legacy": (partial(evt21.decode, True), (-1, -1), EVT21, CHUNK // 32 + 1),
+    "2.1": (partial(evt21.decode, False), (-1, -1), EVT21, CHUNK // 32 + 1),  # of up to 32
     "3": (evt3.decode, evt3.State(), EVT3, CHUNK // 12 + 1),  # of up to 12 events
 }
 TRIGGERS = {
