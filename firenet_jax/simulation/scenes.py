@@ -162,11 +162,15 @@ def random_scene(
     depth = jnp.sort(uniform((0.5, 0.95), (settings.objects,)))[::-1]
     depth = jnp.concatenate([jnp.ones(1), depth])
     focal = side * uniform((0.8, 1.6))
-    camera = _camera_motion(camera_key, focal, side)
+    # Handheld: sideways by up to half a picture, nearer and farther by up to a fifth, turning.
+    camera = _wander(camera_key, side, (0.1, 0.5), focal, (0.0, 0.2), (0.12, 0.12, 0.4))
     shake = _shake(jax.random.fold_in(camera_key, 1), side, settings)
-    objects = jax.vmap(_object_motion, (0, None, 0))(
-        jax.random.split(object_keys, planes), side, depth
-    )
+
+    def tumble(key, depth):  # across up to half of the picture
+        reach = side * depth
+        return _wander(key, reach, (0.05, 0.5), reach, (0.0, 0.1), (0.15, 0.15, 0.8))
+
+    objects = jax.vmap(tumble)(jax.random.split(object_keys, planes), depth)
     ground = jnp.arange(planes) == 0
     objects = objects._replace(amplitude=jnp.where(ground[:, None, None], 0.0, objects.amplitude))
 
@@ -214,7 +218,7 @@ def random_scene(
         speed=jnp.asarray(speed, jnp.float32),
     )
     # The camera leads; objects move by themselves between a tenth and once as fast.
-    scene = _at_pace(scene, 1.0 / side, log_uniform((0.1, 1.0), (planes,)))
+    scene = _paced(scene, 1.0 / side, log_uniform((0.1, 1.0), (planes,)))
     still = (uniform((0.0, 1.0)) < settings.still) & (shown > 0)
     pace = jnp.where(still, 0.0, scene.camera.pace)
     scene = scene._replace(camera=scene.camera._replace(pace=pace))
@@ -282,13 +286,13 @@ def _waves(uniform, log_uniform, amplitude: jax.Array) -> Motion:
     )
 
 
-def _camera_motion(key: jax.Array, focal: jax.Array, side: float) -> Motion:
-    """Handheld: sideways by up to half a picture, nearer and farther by up to a fifth, turning."""
+def _wander(key: jax.Array, side, across, distance, along, turn) -> Motion:
+    """Sideways and nearer by shares (least, greatest) of these pixels, turning by these radians."""
     uniform, log_uniform = _dice(key, 6 + 18 * WAVES)
-    across = side * uniform((0.1, 0.5), (2,))
-    along = focal * uniform((0.0, 0.2), (1,))
-    turn = jnp.array([0.12, 0.12, 0.4]) * uniform((0.0, 1.0), (3,))
-    return _waves(uniform, log_uniform, jnp.concatenate([across, along, turn]))
+    sideways = side * uniform(across, (2,))
+    nearer = distance * uniform(along, (1,))
+    turned = jnp.array(turn) * uniform((0.0, 1.0), (3,))
+    return _waves(uniform, log_uniform, jnp.concatenate([sideways, nearer, turned]))
 
 
 def _shake(key: jax.Array, side: float, settings: SceneSettings) -> Motion | None:
@@ -301,15 +305,6 @@ def _shake(key: jax.Array, side: float, settings: SceneSettings) -> Motion | Non
     shares = jnp.append(uniform((0.3, 1.0), (2,)), jnp.zeros(4))
     motion = _waves(uniform, log_uniform, jnp.where(shakes, across * shares, 0.0))
     return motion._replace(frequency=motion.frequency * speed / across)
-
-
-def _object_motion(key: jax.Array, side: float, depth: jax.Array) -> Motion:
-    """Across up to half of the picture, with a tumble."""
-    uniform, log_uniform = _dice(key, 6 + 18 * WAVES)
-    across = side * depth * uniform((0.05, 0.5), (2,))
-    along = side * depth * uniform((0.0, 0.1), (1,))
-    turn = jnp.array([0.15, 0.15, 0.8]) * uniform((0.0, 1.0), (3,))
-    return _waves(uniform, log_uniform, jnp.concatenate([across, along, turn]))
 
 
 def _lit(key: jax.Array, textures: jax.Array, settings: SceneSettings) -> jax.Array:
@@ -375,12 +370,12 @@ def _outline(key: jax.Array) -> jax.Array:
     return jnp.minimum(jnp.minimum(edge - r, r - hole), border)
 
 
-def _at_pace(scene: Scene, camera: float, objects: jax.Array) -> Scene:
-    """The scene with these paces, the objects' in parts of the camera's."""
+def _paced(scene: Scene, factor, objects: jax.Array | float = 1.0) -> Scene:
+    """The scene, its paces times this factor, those of its objects times another one, too."""
     return scene._replace(
-        camera=scene.camera._replace(pace=jnp.asarray(camera, jnp.float32)),
-        shake=scene.shake and scene.shake._replace(pace=jnp.asarray(camera, jnp.float32)),
-        motions=scene.motions._replace(pace=camera * objects),
+        camera=scene.camera._replace(pace=scene.camera.pace * factor),
+        shake=scene.shake and scene.shake._replace(pace=scene.shake.pace * factor),
+        motions=scene.motions._replace(pace=scene.motions.pace * factor * objects),
     )
 
 
@@ -392,12 +387,6 @@ def _at_speed(scene: Scene, speed, duration, height: int, width: int) -> Scene:
     """
     times = duration * jnp.linspace(0.0, 1.0, 128)
 
-    def paced(scene, factor):
-        objects = scene.motions._replace(pace=scene.motions.pace * factor)
-        camera = scene.camera._replace(pace=scene.camera.pace * factor)
-        shake = scene.shake and scene.shake._replace(pace=scene.shake.pace * factor)
-        return scene._replace(camera=camera, shake=shake, motions=objects)
-
     def improve(round, carry):
         scene, _ = carry
         peak = 1.05 * speeds(scene, times, height=height, width=width).max()
@@ -405,7 +394,7 @@ def _at_speed(scene: Scene, speed, duration, height: int, width: int) -> Scene:
         # The later rounds only slow down, so that the bound holds; the last only measures.
         most = jnp.array([jnp.inf, jnp.inf, jnp.inf, 1.0, 1.0, 1.0])[round]
         factor = jnp.where(round == 6, 1.0, jnp.minimum(factor, most))
-        return paced(scene, factor), peak
+        return _paced(scene, factor), peak
 
     scene, peak = jax.lax.fori_loop(0, 7, improve, (scene, jnp.zeros(())))
     return scene._replace(speed=peak)
@@ -440,13 +429,12 @@ def _product(a: jax.Array, b: jax.Array) -> jax.Array:
 def _rotation(angles: jax.Array) -> jax.Array:
     """Angles about x, y, z (3,) -> rotation (3, 3), about x first."""
     (cx, cy, cz), (sx, sy, sz) = jnp.cos(angles), jnp.sin(angles)
-    return jnp.stack(
-        [
-            jnp.stack([cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx]),
-            jnp.stack([sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx]),
-            jnp.stack([-sy, cy * sx, cy * cx]),
-        ]
+    rows = (
+        [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
+        [sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx],
+        [-sy, cy * sx, cy * cx],
     )
+    return jnp.stack([jnp.stack(row) for row in rows])
 
 
 def _to_image(scene: Scene, t: jax.Array, height: int, width: int) -> jax.Array:
@@ -457,13 +445,8 @@ def _to_image(scene: Scene, t: jax.Array, height: int, width: int) -> jax.Array:
         camera += _pose(scene.shake, clock)
     turn = _rotation(camera[3:])
     # Distances in parts of the focal length, so that all entries are of the order of 1.
-    lens = jnp.stack(
-        [
-            jnp.array([1.0, 0.0, (width - 1) / 2]),
-            jnp.array([0.0, 1.0, (height - 1) / 2]),
-            jnp.array([0.0, 0.0, 1.0]),
-        ]
-    )
+    rows = [1.0, 0.0, (width - 1) / 2], [0.0, 1.0, (height - 1) / 2], [0.0, 0.0, 1.0]
+    lens = jnp.stack([jnp.array(row) for row in rows])
     scale = jnp.stack([jnp.ones(()), jnp.ones(()), 1 / scene.focal])[:, None]
 
     def one(place, motion):

@@ -233,10 +233,4 @@ def marks(rng, size: int) -> np.ndarray:
     return _drawing(rng, size, draw)
 
 
-PROCEDURAL = {
-    "dead_leaves": dead_leaves,
-    "clouds": clouds,
-    "gratings": gratings,
-    "polygons": polygons,
-    "marks": marks,
-}
+PROCEDURAL = {draw.__name__: draw for draw in (dead_leaves, clouds, gratings, polygons, marks)}
