@@ -119,16 +119,13 @@ def advance(
     low, high = FIXED_RANGE
     if settings.adaptive_range:
         low, high = _follow(state.low, state.high, log_intensity, elapsed)
-    image = jnp.clip((_intensity(log_intensity) - low) / (high - low), 0.0, 1.0)
+    # exp(L + ln 1.5) - 1: the initial L, 0, is the grey in the middle, 0.5.
+    intensity = 1.5 * jnp.exp(log_intensity) - 1
+    image = jnp.clip((intensity - low) / (high - low), 0.0, 1.0)
     if settings.bilateral:
         image = bilateral(image, settings.bilateral)
     low, high = jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32)
     return HighPassState(log_intensity, low, high, jnp.asarray(sums.time)), image
-
-
-def _intensity(log_intensity: jax.Array) -> jax.Array:
-    """exp(L + ln 1.5) - 1: the initial L, 0, is the grey in the middle, 0.5."""
-    return 1.5 * jnp.exp(log_intensity) - 1
 
 
 def _follow(low, high, log_intensity, elapsed) -> tuple[jax.Array, jax.Array]:

@@ -107,12 +107,8 @@ def step(
 
 def pack(window: Window, height: int, width: int, packet: int = 1000) -> Packets:
     """A window's events, in time order -> packets of so many events on the device."""
-    pixel, age, p = columns(window, height, width)
-    unused = -len(pixel) % packet
-    pixel = np.pad(pixel, (0, unused), constant_values=height * width)
-    age, p = np.pad(age, (0, unused)), np.pad(p, (0, unused))
+    pixel, age, p = (c.reshape(-1, packet) for c in columns(window, height, width, packet))
     count = np.array(-(-len(window.events) // packet), np.int32)
-    pixel, age, p = (column.reshape(-1, packet) for column in (pixel, age, p))
     return Packets(pixel, age, p, count, clock(window.time))
 
 

@@ -14,23 +14,22 @@ from firenet_jax.tensors import capacity
 from firenet_jax.windows import Window
 
 
-def columns(window: Window, height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Window of N events -> pixel, age, p, each (E,), E being `capacity(N)`.
+def columns(
+    window: Window, height: int, width: int, multiple: int = 1
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Window of N events -> pixel, age, p, each (E,), E being `capacity(N)` or the next multiple.
 
     pixel: int32, row * width + column; height * width, which every sum over segments drops, in
     unused places and for events outside the sensor. age: float32 s. p: bool.
     """
     events, time = window
-    size = capacity(len(events))
+    unused = 0, -(-capacity(len(events)) // multiple) * multiple - len(events)
     x, y = events.x.astype(np.int32), events.y.astype(np.int32)
     seen = (0 <= x) & (x < width) & (0 <= y) & (y < height)
-    pixel = np.full(size, height * width, np.int32)
-    age = np.zeros(size, np.float32)
-    p = np.zeros(size, bool)
-    pixel[: len(events)] = np.where(seen, y * width + x, height * width)
-    age[: len(events)] = (time - events.t) * 1e-6
-    p[: len(events)] = events.p
-    return pixel, age, p
+    pixel = np.where(seen, y * width + x, np.int32(height * width))
+    age = ((time - events.t) * 1e-6).astype(np.float32)
+    pixel = np.pad(pixel, unused, constant_values=height * width)
+    return pixel, np.pad(age, unused), np.pad(events.p, unused)
 
 
 def clock(time: int) -> np.ndarray:
