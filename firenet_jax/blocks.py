@@ -14,6 +14,7 @@ from jax.ad_checkpoint import checkpoint_name
 
 from firenet_jax import native
 from firenet_jax.convolution import (
+    ACTIVATIONS,
     CONVOLVED,
     by_xla,
     choose,
@@ -23,6 +24,7 @@ from firenet_jax.convolution import (
 )
 
 Parameters = tuple[jax.Array, jax.Array]
+_slope = ACTIVATIONS["sigmoid"][1]  # the derivative of the sigmoid where its value is y
 
 
 def gru(h: jax.Array, x: jax.Array, gates: Parameters, candidate: Parameters) -> jax.Array:
@@ -40,11 +42,6 @@ def residual(x: jax.Array, first: Parameters, second: Parameters) -> jax.Array:
 
 def _kept(maps):
     return tuple(checkpoint_name(each, CONVOLVED) for each in maps)
-
-
-def _slope(y):
-    """The derivative of the sigmoid where its value is y."""
-    return y * (1 - y)
 
 
 # ---- ConvGRU
