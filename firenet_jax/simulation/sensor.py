@@ -110,20 +110,13 @@ class SensorSettings:
 
     def __post_init__(self):
         """Raises SettingsError for invalid values."""
-        for name in ("threshold_range", "refractory_range"):
-            if getattr(self, name) is not None:
-                check_range(name, getattr(self, name))
-        for name in ("noise", "leak", "hot", "cutoff"):
-            if _on(getattr(self, name)):
-                check_range(name, getattr(self, name))
-        if self.noise_in_light is not None:
-            check_range("noise_in_light", self.noise_in_light)
-        if _on(self.flicker):
-            check_range("flicker", self.flicker)
-            if self.flicker[1] > 1:
-                raise SettingsError(
-                    f"flicker is {self.flicker}, but light is not negative: at most 1"
-                )
+        ranges = "threshold_range", "refractory_range", "noise_in_light"  # 0 0 turns none off
+        for name in (*ranges[:2], "noise", "leak", "hot", "cutoff", ranges[2], "flicker"):
+            bounds = getattr(self, name)
+            if _on(bounds) or bounds is not None and name in ranges:
+                check_range(name, bounds)
+        if _on(self.flicker) and self.flicker[1] > 1:
+            raise SettingsError(f"flicker is {self.flicker}, but light is not negative: at most 1")
         check_share("clean", self.clean, "sequences")
         if _on(self.hot) and self.hot[1] > 1:
             raise SettingsError(f"hot is {self.hot}, but is a part of the pixels: at most 1")
@@ -159,12 +152,8 @@ FAULTY = SensorSettings(
 
 def with_faults(sensor: SensorSettings) -> SensorSettings:
     """FAULTY, overridden by everything that these settings change from their defaults."""
-    plain = SensorSettings()
-    chosen = {
-        field.name: getattr(sensor, field.name)
-        for field in dataclasses.fields(sensor)
-        if getattr(sensor, field.name) != getattr(plain, field.name)
-    }
+    plain = vars(SensorSettings())
+    chosen = {name: value for name, value in vars(sensor).items() if value != plain[name]}
     if "refractory" in chosen:
         chosen.setdefault("refractory_range", None)
     return dataclasses.replace(FAULTY, **chosen)

@@ -154,21 +154,13 @@ def _setups(
     numbers: (B,) int32, the number of earlier sequences in the same place of the batch.
     """
 
+    names = "renderings", "motion", "slow", "swift", "scene", "sensor"
+    shared: Any = {name: getattr(settings, name) for name in names}
+    shared |= {"batch": 1, "height": settings.crop, "width": settings.crop}
+
     def one(place, length, number):
-        setup = random_setups(
-            jax.random.fold_in(jax.random.fold_in(key, place), number),
-            textures,
-            batch=1,
-            windows=length * settings.windows,
-            height=settings.crop,
-            width=settings.crop,
-            renderings=settings.renderings,
-            motion=settings.motion,
-            slow=settings.slow,
-            swift=settings.swift,
-            scene=settings.scene,
-            sensor=settings.sensor,
-        )
+        own = jax.random.fold_in(jax.random.fold_in(key, place), number)
+        setup = random_setups(own, textures, windows=length * settings.windows, **shared)
         return jax.tree.map(lambda leaf: leaf[0], setup)
 
     return jax.vmap(one)(jnp.arange(settings.batch), lengths, numbers)
