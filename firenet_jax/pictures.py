@@ -20,6 +20,7 @@ import numpy as np
 from scipy.special import ndtr  # not norm.cdf, the same: scipy.stats takes half a second to import
 
 from firenet_jax.errors import SettingsError
+from firenet_jax.settings import check_sizes
 
 HISTORY = 11  # images whose ranges have a median, which is the range shown
 # Of the automatic range: the part of the pixels that may be darker, and that may be brighter; what
@@ -46,9 +47,7 @@ class Display:
     it off."""
 
     def __post_init__(self):
-        for name in ("unsharp", "bilateral"):
-            if not getattr(self, name) >= 0:
-                raise SettingsError(f"{name} is {getattr(self, name)}, but must be 0 or more")
+        check_sizes(self, "unsharp", "bilateral", zero=True)
         if self.range not in get_args(Range):
             raise SettingsError(
                 f"range is {self.range!r}, but must be one of {', '.join(get_args(Range))}"

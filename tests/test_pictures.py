@@ -120,7 +120,7 @@ def test_smoothed_pictures_keep_their_edges():
 
 
 @pytest.mark.parametrize("name", ["unsharp", "bilateral"])
-@pytest.mark.parametrize("value", [-1.0, float("nan")])
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
 def test_impossible_settings(name, value):
     with pytest.raises(ValueError, match=f"{name} is"):
         Display(**{name: value})
