@@ -493,12 +493,15 @@ def test_files_of_others_are_not_replaced(tmp_path):
         (tmp_path / "run" / name).unlink()
 
 
-def test_a_run_resumes_on_the_files_that_it_began_with(tmp_path, monkeypatch):
+@pytest.mark.parametrize("ending", ["h5", "png"])
+def test_a_run_resumes_on_the_files_that_it_began_with(tmp_path, ending):
     (tmp_path / "set/train").mkdir(parents=True)
-    (tmp_path / "set/train/a.h5").write_bytes(b"a")
-    asked = tiny(tmp_path / "run", data=(tmp_path / "set",))
+    (tmp_path / f"set/train/a.{ending}").write_bytes(b"a")
+    there = tmp_path / "set"
+    source = {"data": (there,)} if ending == "h5" else {"images": there}
+    asked = tiny(tmp_path / "run", **source)
     record = train._record(asked)
-    (tmp_path / "set/train/b.h5").write_bytes(b"b")
+    (tmp_path / f"set/train/b.{ending}").write_bytes(b"b")
     other = train._record(asked)
     assert record["files"] != other["files"]
     assert {name for name in record if record[name] != other[name]} == {"files"}
@@ -506,9 +509,10 @@ def test_a_run_resumes_on_the_files_that_it_began_with(tmp_path, monkeypatch):
     (tmp_path / "run/settings.json").write_text(json.dumps(record))
     with pytest.raises(OutputError, match="files was"):
         train._check_settings(asked.output, asked)
-    del record["files"]  # of a run of before they were recorded
-    (tmp_path / "run/settings.json").write_text(json.dumps(record))
-    train._check_settings(asked.output, asked)
+    without = {name: value for name, value in record.items() if name != "files"}
+    for earlier in (without, record | {"files": None}):  # of runs of before they were recorded
+        (tmp_path / "run/settings.json").write_text(json.dumps(earlier))
+        train._check_settings(asked.output, asked)
 
 
 def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypatch):

@@ -50,7 +50,7 @@ def load_textures(
     if pictures is None:
         paths = photographs()
     else:
-        paths = pictures if isinstance(pictures, list) else _pictures(Path(pictures))
+        paths = pictures if isinstance(pictures, list) else pictures_in(Path(pictures))
     drawn = round(procedural * count) if paths else count
     textures = _cuttings(rng, paths, count - drawn, size, pictures) if count > drawn else []
     kinds = list(PROCEDURAL.values())
@@ -70,7 +70,10 @@ def photographs(packages: dict[str, tuple[str, ...]] = PHOTOGRAPHS) -> list[Path
     return found
 
 
-def _pictures(folder: Path) -> list[Path]:
+def pictures_in(folder: Path) -> list[Path]:
+    """The pictures in a folder and in folders below it, without those of `HELD_OUT`, sorted.
+
+    Raises PictureError where there are none."""
     if not folder.is_dir():
         raise PictureError(f"{folder}: no such folder: name one with pictures in it")
     held_out = {name for names in HELD_OUT.values() for name in names}

@@ -33,7 +33,7 @@ from firenet_jax.devices import TIME_BATCH, is_first, join, replicated, sharding
 from firenet_jax.errors import CheckpointError, FirenetError, OutputError, SettingsError, logger
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.simulation.sensor import Simulation
-from firenet_jax.simulation.textures import load_textures
+from firenet_jax.simulation.textures import load_textures, pictures_in
 from firenet_jax.storage import runs
 from firenet_jax.storage.files import locked, write_text
 from firenet_jax.storage.progress import bar
@@ -264,11 +264,12 @@ def _record(settings: Train) -> dict:
 
 
 def _files(settings: Train) -> str | None:
-    """Names and sizes of the sequences, in short; of recordings, `prepare` sees to it."""
-    if not settings.data or settings.on_recordings:
+    """Names and sizes of sequences or pictures, in short; of recordings, `prepare` sees to it."""
+    folder = settings.data[0] if settings.data else settings.images
+    if folder is None or settings.on_recordings:
         return None
-    folder = settings.data[0]
-    found = [(str(path.relative_to(folder)), path.stat().st_size) for path in find(folder)]
+    paths = find(folder) if settings.data else pictures_in(folder)
+    found = [(str(path.relative_to(folder)), path.stat().st_size) for path in paths]
     return hashlib.sha256(repr(found).encode()).hexdigest()[:16]
 
 
@@ -290,8 +291,9 @@ def _check_settings(folder: Path, settings: Train) -> None:
                 )
         return
     now = _record(settings)
-    unknown = {} if "files" in found else {"files": now["files"]}  # a run of before it was kept
-    found = runs.completed(found, _record(Train(folder)) | unknown)
+    if found.get("files") is None:  # a run of before it was kept
+        found["files"] = now["files"]
+    found = runs.completed(found, _record(Train(folder)))
     done = (folder / "checkpoints" / str(found["steps"])).is_dir()
     longer = isinstance(found["steps"], int) and found["steps"] < settings.steps
     if longer and done and not runs.differences(found, now, but=(*UNRECORDED, "steps")):
