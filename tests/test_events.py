@@ -5,7 +5,18 @@ import numpy as np
 import pytest
 
 from firenet_jax.errors import RecordingError
-from firenet_jax.events import Events, checked, rate_in_words
+from firenet_jax.events import (
+    BINS,
+    MAX_TIME,
+    Events,
+    Recording,
+    Rows,
+    checked,
+    concatenate,
+    counted,
+    rate_in_words,
+    until_damage,
+)
 
 
 @pytest.mark.parametrize("p", [[-1, 1], [0, 1], [False, True]])
@@ -63,14 +74,145 @@ def test_a_place_outside_is_named_where_two_events_have_one_time():
         passed([many(0, 3), row(2, x=24)])
 
 
-def test_events_do_not_change():
+def rows_of(events, *bad):
+    """As a reader gives them: these rows are no events."""
+    return Rows(events, np.isin(np.arange(len(events)), bad), RecordingError("what the file says"))
+
+
+def recording_of(*chunks):
+    return Recording(Path("a"), "test", 18, 24, lambda: iter(chunks))
+
+
+@pytest.mark.parametrize("made", [row(1), rows_of(row(1)), recording_of()])
+def test_events_do_not_change(made):
     with pytest.raises(FrozenInstanceError):
-        row(1).t = np.zeros(1)
+        setattr(made, next(iter(made.__dataclass_fields__)), np.zeros(1))
+
+
+@pytest.mark.parametrize("make", [lambda: row(1), lambda: rows_of(row(1))])
+def test_chunks_are_compared_as_objects_and_are_small(make):
+    """Compared column by column they would be neither equal nor not; there are millions of them."""
+    one, other = make(), make()
+    assert one == one and one != other and len({one, other}) == 2
+    assert not hasattr(one, "__dict__")
+
+
+def test_what_a_recording_is_unless_its_file_says_more():
+    recording = recording_of(row(1))
+    assert recording.pixels == 18 * 24
+    assert recording.inferred is recording.grey is False
+    assert recording.count is recording.frames is recording.triggers() is None
+
+
+def test_numbers_that_the_paper_and_float64_set():
+    """Five bins; times that a float of 64 bits tells apart, and the first two that it does not."""
+    assert BINS == 5
+    assert float(MAX_TIME - 1) < float(MAX_TIME) == float(MAX_TIME + 1)
+
+
+def test_columns_of_the_right_kind_are_not_copied():
+    t = np.arange(5)
+    events = Events.of(t, np.int16(t), np.int16(t), t > 2)
+    assert np.shares_memory(events.t, t)
+    assert concatenate([events]) is events
+
+
+def test_chunks_are_joined_and_with_them_what_is_wrong():
+    joined = concatenate([many(0, 3), many(5, 2)])
+    assert joined.t.tolist() == [0, 1, 2, 5, 6] and len(joined) == 5
+    wrong = rows_of(many(5, 2), 1)
+    joined = concatenate([many(0, 3), wrong, rows_of(many(7, 2), 0)])
+    assert joined.events.t.tolist() == [0, 1, 2, 5, 6, 7, 8] and len(joined) == 7
+    assert joined.bad.tolist() == [False] * 4 + [True, True, False] and joined.error is wrong.error
+
+
+def test_one_is_no_plural():
+    assert [counted(n, "event") for n in (0, 1, 2000)] == ["0 events", "1 event", "2,000 events"]
 
 
 def test_events_that_are_right_pass_as_they_are():
     found, said = passed([row(5), Events.empty(), row(5, x=23), row(9, x=0)])
     assert found == [[(5, 1)], [(5, 23)], [(9, 0)]] and not said
+    one_time = Events.of([9] * 4, [0, 23, 0, 23], [0, 0, 17, 17], [0, 1, 0, 1])
+    assert passed([row(-MAX_TIME), one_time])[0] == [[(-MAX_TIME, 1)], [(9, 0), (9, 23)] * 2]
+
+
+def test_what_is_wrong_is_not_passed_over_unless_one_says_so():
+    with pytest.raises(RecordingError, match="a, event 3: time runs backwards"):
+        list(checked([row(1), row(5), row(4)], Path("a"), None, None))
+
+
+@pytest.mark.parametrize("width, outside", [(24, 4), (None, 3)])
+def test_places_just_outside_are_left_out_and_those_just_inside_stay(width, outside):
+    x, y = np.array([0, 23, 0, 23, -1, 5, 24, 5]), np.array([0, 0, 17, 17, 5, -1, 5, 18])
+    edges = Events.of(np.full(8, 9000), x, y, x > 5)
+    found, said = passed([many(0, 8000), edges], strict=False, width=width)
+    inside = (x >= 0) & (y >= 0) & (y < 18) & ((x < 24) | (width is None))
+    assert [x for part in found for t, x in part if t == 9000] == x[inside].tolist()
+    assert said[0].startswith("a, event 8005: x is -1") and f"left out: {outside} of" in said[0]
+
+
+def test_one_in_a_thousand_may_be_wrong_and_the_first_of_them_is_said():
+    chunks = [many(0, 999, [5]), many(2000, 999, [1]), many(9000, 998, [2, 3])]
+    found, said = passed(chunks[:2], strict=False)
+    assert sum(map(len, found)) == 1998
+    assert said[0].startswith("a, event 1000: time runs backwards, from 998 to 5 us")
+    with pytest.raises(RecordingError, match="event 2999: time runs backwards, from 9997 to 2"):
+        passed(chunks, strict=False)
+
+
+def test_rows_that_the_file_damages_are_left_out_and_told_in_its_words():
+    chunks = [many(0), rows_of(many(2000), 7), many(4000)]
+    found, said = passed(chunks, strict=False)
+    assert [t for part in found for t, _ in part] == [t for t in range(6000) if t != 2007]
+    assert said == ["what the file says; left out: 1 of 6,000 events"]
+    with pytest.raises(RecordingError, match="what the file says"):
+        passed(chunks)
+    with pytest.raises(RecordingError, match="event 2001: x is 30, outside"):  # its own fault
+        passed([many(0), rows_of(concatenate([row(2000, x=30), many(2001, 5)]), 3)])
+
+
+@pytest.mark.parametrize("strict", [True, False])
+@pytest.mark.parametrize("before", [0, 1, 2500])
+def test_damage_ends_the_reading_after_what_comes_before_it(strict, before):
+    def chunks():
+        yield many(0, before)
+        raise RecordingError("torn")
+
+    said, seen = [], []
+    found = checked(chunks(), Path("a"), 18, 24, strict=strict, say=lambda *what: said.append(what))
+    if strict or not before:
+        with pytest.raises(RecordingError, match="torn"):
+            seen.extend(found)
+        assert not said
+    else:
+        seen.extend(found)
+        assert said == [(f"torn; what comes before is read: {counted(before, 'event')}", before)]
+    assert sum(map(len, seen)) == before
+
+
+def test_a_first_look_ends_at_damage_and_raises_it_only_if_there_is_nothing_else():
+    def chunks(*before):
+        yield from before
+        raise RecordingError("torn")
+
+    assert [len(part) for part in until_damage(chunks(many(0, 3), row(7)))] == [3, 1]
+    for before in ((), (Events.empty(),)):
+        with pytest.raises(RecordingError, match="torn"):
+            list(until_damage(chunks(*before)))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_what_is_left_out_is_the_least_that_can_be(seed):
+    """As many stay as the longest sequence in order has, found by looking at all pairs."""
+    late = np.random.default_rng(seed).integers(7994, 8006, 7)
+    found, _ = passed([many(0, 8000), Events.of(late, *np.ones((3, 7))), many(8005)], strict=False)
+    kept = np.array([t for part in found for t, _ in part])
+    assert (np.diff(kept) >= 0).all()
+    times, longest = [*range(7980, 8000), *late.tolist(), 8005], []
+    for k, time in enumerate(times):
+        longest.append(1 + max((longest[i] for i in range(k) if times[i] <= time), default=0))
+    assert len(kept) == 7980 + longest[-1] + 1999
 
 
 @pytest.mark.parametrize(
