@@ -138,8 +138,8 @@ def test_events_that_are_right_pass_as_they_are():
 
 
 def test_what_is_wrong_is_not_passed_over_unless_one_says_so():
-    with pytest.raises(RecordingError, match="a, event 3: time runs backwards"):
-        list(checked([row(1), row(5), row(4)], Path("a"), None, None))
+    with pytest.raises(RecordingError, match="a, event 5001: time runs backwards"):
+        list(checked([many(0, 5000), row(4)], Path("a"), None, None))
 
 
 @pytest.mark.parametrize("width, outside", [(24, 4), (None, 3)])
@@ -264,3 +264,5 @@ def test_as_few_as_possible_are_left_out_across_chunks():
     early = [many(0), many(2000), many(1998, count=1, then=range(4000, 6000))]
     found, said = passed(early, strict=False)
     assert [t for part in found for t, _ in part] == [*range(4000), *range(4000, 6000)]
+    one = [many(0, then=[9000]), many(2000, 2), many(9001)]
+    assert "left out: 1 of 4,003 events" in passed(one, strict=False)[1][0]

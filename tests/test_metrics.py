@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 import references_metrics as references
 from scipy.ndimage import gaussian_filter
-from skimage.metrics import mean_squared_error, peak_signal_noise_ratio
+from skimage.metrics import (
+    mean_squared_error,
+    peak_signal_noise_ratio,
+    structural_similarity,
+)
 
 from firenet_jax.evaluation import metrics
 
@@ -100,6 +104,20 @@ def test_ssim_of_faint_texture_on_white():
     np.testing.assert_allclose(metrics.ssim(image, truth), references.ssim(image, truth), atol=1e-5)
 
 
+def test_ssim_where_is_the_mean_of_the_map_there():
+    rng = np.random.default_rng(0)
+    a, b = rng.random((2, 30, 40)).astype(np.float32)
+    there = rng.random((30, 40)) < 0.3
+    options = {"gaussian_weights": True, "use_sample_covariance": False, "data_range": 1.0}
+    _, whole = structural_similarity(a, b, full=True, **options)
+    inner = np.s_[5:-5, 5:-5]
+    expected = whole[inner][there[inner]].mean()
+    assert abs(float(metrics.ssim_where(a, b, there)) - expected) < 1e-5
+    everywhere = metrics.ssim_where(a, b, np.ones((30, 40), bool))
+    assert abs(float(everywhere) - float(metrics.ssim(a, b))) < 1e-6
+    assert np.isnan(metrics.ssim_where(a, b, np.zeros((30, 40), bool)))
+
+
 def test_psnr_equals_scikit_image():
     image, truth = cases()
     actual = metrics.psnr(image, truth)
@@ -120,6 +138,38 @@ def test_ms_ssim_takes_as_many_scales_as_fit():
     image = gaussian_filter(truth, 1)
     expected = references.ms_ssim(image.astype(np.float64), truth.astype(np.float64))
     np.testing.assert_allclose(metrics.ms_ssim(image, truth), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "shape", [(17, 19), (33, 40), (40, 34), (67, 70), (70, 68), (136, 141)], ids=str
+)
+def test_cw_ssim_takes_as_many_scales_as_fit(shape):
+    """One below 34 pixels, two below 68, never more than three."""
+    truth = texture(8, *shape)
+    image = gaussian_filter(truth, 1)
+    expected = references.cw_ssim(image.astype(np.float64), truth.astype(np.float64))
+    np.testing.assert_allclose(metrics.cw_ssim(image, truth), expected, atol=1e-5)
+
+
+def test_factors_near_zero_are_continued_by_a_straight_line():
+    """From 0.001 down: half as far from 0 is half as much, and below 0 it is 0."""
+    power = lambda base: float(metrics._power(jnp.float32(base), 0.3))  # noqa: E731
+    for base in (1.0, 0.5, 0.0011, 0.001):
+        assert power(base) == pytest.approx(base**0.3, rel=1e-5)
+    assert power(0.0005) == pytest.approx(0.5 * 0.001**0.3, rel=1e-5)
+    assert power(0.0) == power(-0.5) == 0
+    assert jax.grad(lambda base: metrics._power(base, 0.3))(0.0002) == pytest.approx(
+        0.001**-0.7, rel=1e-4
+    )
+
+
+def test_a_faint_dot_on_black_is_no_black_image_to_haarpsi():
+    """All its weights add up to little."""
+    image, truth = np.zeros((2, 16, 16), np.float32)
+    image[8:10, 8:10] = 0.1
+    expected = references.haarpsi(image.astype(np.float64), truth.astype(np.float64))
+    assert 0.1 < expected < 0.9
+    np.testing.assert_allclose(metrics.haarpsi(image, truth), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -312,6 +362,8 @@ def test_jitted_equals_eager_and_other_images_do_not_recompile(name):
 def test_wrong_sizes_are_refused():
     with pytest.raises(ValueError, match="cannot be compared"):
         metrics.mse(np.zeros((4, 5)), np.zeros((2, 4, 5)))
+    with pytest.raises(ValueError, match="cannot be compared"):
+        metrics.mse(np.zeros(4), np.zeros(4))
     with pytest.raises(ValueError, match="11"):
         metrics.ssim(np.zeros((10, 30)), np.zeros((10, 30)))
     with pytest.raises(ValueError, match="MS-SSIM needs"):

@@ -281,22 +281,6 @@ def test_what_is_near_events_stays_so_through_a_chain(tmp_path):
     assert abs(loss_after([corner, silent, silent], [images, images, close]) - third) < 1e-5
 
 
-def test_ssim_where_is_the_mean_of_the_map_there():
-    from skimage.metrics import structural_similarity
-
-    rng = np.random.default_rng(0)
-    a, b = rng.random((2, 30, 40)).astype(np.float32)
-    there = rng.random((30, 40)) < 0.3
-    options = {"gaussian_weights": True, "use_sample_covariance": False, "data_range": 1.0}
-    _, whole = structural_similarity(a, b, full=True, **options)
-    inner = np.s_[5:-5, 5:-5]
-    expected = whole[inner][there[inner]].mean()
-    assert abs(float(metrics.ssim_where(a, b, there)) - expected) < 1e-5
-    everywhere = metrics.ssim_where(a, b, np.ones((30, 40), bool))
-    assert abs(float(everywhere) - float(metrics.ssim(a, b))) < 1e-6
-    assert np.isnan(metrics.ssim_where(a, b, np.zeros((30, 40), bool)))
-
-
 @pytest.mark.parametrize("warm", [10_000_000, 55_000])
 def test_the_end_is_judged_as_reconstruct_shows_it(folder, monkeypatch, warm):
     """Against the public functions, from the first window or from a later one on."""

@@ -161,8 +161,45 @@ def test_frames_that_last_for_hours_are_on_the_clock_of_events_after_them():
     assert sum(len(window.events) for window in cut(recording, Windows(frame_to_frame=True))) == 2
 
 
-def test_a_step_may_be_as_short_as_a_clock_tick():
+def test_windows_and_steps_may_be_as_short_as_a_clock_tick():
     assert Windows(duration=0.005, step=0.001).step == 0.001
+    recording = recording_of(range(3))
+    assert times_of(recording, duration=0.001) == [[0], [1], [2]]
+    assert times_of(recording, events=2, longest=0.001) == [[0], [1], [2]]
+    assert times_of(recording_of(range(4), frames=[0, 1]), frame_to_frame=True) == [
+        [0], [1], [2], [3],
+    ]  # fmt: skip
+
+
+def test_windows_are_cut_in_one_way_which_may_be_any():
+    """The greatest number that can be said; a step as long as the window; a number at least."""
+    recording = recording_of([0, 1, 2, 999, 1000, 1001])
+    assert Windows(events=2**31 - 1).count(6) == 2**31 - 1
+    assert times_of(recording, duration=1, step=1) == times_of(recording, duration=1)
+    assert times_of(recording, duration=1) == [[0, 1, 2, 999], [1000, 1001]]
+    assert [Windows().count(pixels) for pixels in (1, 3, 4, 100)] == [1, 1, 1, 35]
+    assert Windows(events_per_pixel=0.5).count(100) == 50
+    assert Windows(frame_to_frame=False).longest is None
+    for one in ({"events": 5}, {"events_per_pixel": 1.0}, {"duration": 5.0}):
+        with pytest.raises(ValueError, match="choose one"):
+            Windows(frame_to_frame=True, **one)
+
+
+@pytest.mark.parametrize(
+    "choice, said",
+    [
+        ({}, "windows of 0.35 events per pixel (35)"),
+        ({"events_per_pixel": 12.5}, "windows of 12.5 events per pixel (1,250)"),
+        ({"events": 1}, "windows of 1 event"),
+        ({"events": 2000, "step": 500}, "windows of 2,000 events, one every 500 events"),
+        ({"duration": 7.5}, "windows of 7.5 ms"),
+        ({"duration": 20, "step": 2.5}, "windows of 20 ms, one every 2.5 ms"),
+        ({"frame_to_frame": True}, "windows between frames"),
+        ({"events": 9, "longest": 40}, "windows of 9 events, at most 40 ms"),
+    ],
+)
+def test_windows_in_words(choice, said):
+    assert in_words(Windows(**choice), 100) == said
 
 
 def test_equal_choices_are_one_choice():
@@ -205,7 +242,8 @@ def test_no_events_no_windows():
         ({"events_per_pixel": 1e308}, "at most 2147483647"),
         ({"duration": -1}, "more than 0"),
         ({"duration": float("nan")}, "more than 0"),
-        ({"duration": 0.0001}, "whole microseconds"),
+        ({"duration": 0.0001}, "duration is 0.0001 ms"),
+        ({"events": 5, "longest": 0.0001}, "longest is 0.0001 ms"),
         ({"duration": 5, "step": 0.0001}, "step is 0.0001 ms"),
         ({"events": 5, "step": 2.5}, "whole number"),
         ({"frame_to_frame": True, "step": 2}, "fixed size"),
@@ -273,11 +311,12 @@ def test_windows_of_at_most_so_many_events_and_so_long():
         assert [window.time for window in found] == [t[i - 1] for i in (*expected[1:], 3000)]
 
 
+@pytest.mark.parametrize("start", [0, 7_000_000])
 @pytest.mark.parametrize(
     "seconds, longest", [(0.0, 0.001), (0.1, 5.0), (0.8, 40.0), (0.8005, 40.0), (60.0, 40.0)]
 )
-def test_what_is_usual_depends_on_how_long_a_recording_is(seconds, longest):
-    t = np.linspace(0, seconds * 1e6, 50).astype(np.int64)
+def test_what_is_usual_depends_on_how_long_a_recording_is(start, seconds, longest):
+    t = start + np.linspace(0, seconds * 1e6, 50).astype(np.int64)
     zeros = np.zeros(50, np.int16)
     windows = usual(iter([Events.of(t, zeros, zeros, zeros)]))
     assert windows == Windows(longest=longest)
@@ -290,3 +329,16 @@ def test_what_is_usual_depends_on_how_long_a_recording_is(seconds, longest):
 def test_a_longest_window_is_one_of_events(other):
     with pytest.raises(ValueError, match="longest limits windows of events"):
         Windows(longest=40.0, **other)
+
+
+def test_no_more_of_a_recording_is_read_than_says_what_is_usual():
+    def chunks():
+        yield at(0, 400_000)
+        yield at(500_000, 800_000)
+        raise AssertionError("read beyond 0.8 s")
+
+    def at(*t):
+        return Events.of(t, *np.zeros((3, len(t)), int))
+
+    assert usual(chunks()) == Windows(longest=40.0)
+    assert usual(iter([])) == Windows(longest=0.001)
