@@ -12,6 +12,7 @@ from firenet_jax.checkpoint import (
     CheckpointError,
     convert,
     load_weights,
+    original_names,
     save_weights,
 )
 from firenet_jax.commands.convert import Convert, run
@@ -166,6 +167,32 @@ def test_wrong_npz(tmp_path, weights, changes, message):
         load_weights(path)
 
 
+@pytest.mark.parametrize("beyond, message", [(0, "no place for 'more'"), (1, "holds 1048577 byt")])
+def test_a_mebibyte_is_read_and_no_more(tmp_path, weights, beyond, message):
+    path = tmp_path / "w.npz"
+    save_weights(path, weights)
+    with zipfile.ZipFile(path) as archive:
+        size = sum(info.file_size for info in archive.infolist())
+    more = np.zeros(2**20 - size - 128 + beyond, np.uint8)  # an array's own header is 128 bytes
+    np.savez(path, **np.load(path), more=more)
+    with pytest.raises(CheckpointError, match=message):
+        load_weights(path)
+
+
+def test_a_reason_is_one_short_line(tmp_path, monkeypatch):
+    """numpy's messages span lines."""
+
+    def damaged(*_, **__):
+        raise ValueError("\n".join(["a long story"] * 100))
+
+    np.savez(tmp_path / "w.npz", a=1)
+    monkeypatch.setattr(np, "load", damaged)
+    with pytest.raises(CheckpointError) as error:
+        load_weights(tmp_path / "w.npz")
+    reason = str(error.value).partition("ValueError: ")[2].partition("); pass")[0]
+    assert reason == " ".join(["a long story"] * 8)[:100] and len(reason) == 100
+
+
 def test_damaged_npz(tmp_path, weights):
     path = tmp_path / "w.npz"
     save_weights(path, weights)
@@ -260,6 +287,21 @@ def test_both_families_name_the_same_network(converted):
     firenet = converted(state_dict(FIRENET))
     plus = converted(state_dict(FIRENET_PLUS))
     jax.tree.map(np.testing.assert_array_equal, firenet.params, plus.params)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_original_names_are_read_as_the_same_weights(converted, weights, family):
+    weights = Weights(params=weights.params, normalise=family == "FireNet")
+    found, tensors = original_names(weights)
+    assert found == family
+    expected = {f"{name}.weight": shape for name, shape in FAMILIES[family].items()}
+    expected |= {f"{name}.bias": shape[:1] for name, shape in FAMILIES[family].items()}
+    assert {name: value.shape for name, value in tensors.items()} == expected
+    assert all(value.flags.c_contiguous for value in tensors.values())
+    assert_equal(converted(tensors), weights)
+    broken = weights.params | {"head": {"bias": np.zeros(16, np.float32)}}
+    with pytest.raises(CheckpointError, match="cannot be written: head/kernel is missing"):
+        original_names(Weights(params=broken, normalise=True))
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float64])

@@ -72,7 +72,7 @@ def test_is_equation_2():
     np.testing.assert_allclose(loss, expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("l0, counted", [(0, 4), (1, 4), (3, 2), (5, 0)])
+@pytest.mark.parametrize("l0, counted", [(0, 4), (1, 4), (3, 2), (4, 1), (5, 0)])
 def test_terms_are_unweighted_means_that_add_up(l0, counted):
     settings = replace(NOTHING, l1=0.3, lambda_tc=1.5, l0=l0, L=20)
     images, truths, *flow = sequence()
@@ -98,6 +98,28 @@ def test_defaults_are_those_of_the_paper():
 def test_weights_that_cannot_be(choice):
     with pytest.raises(ValueError, match=f"{next(iter(choice))} is .* must be 0 or more"):
         Loss(**choice)
+
+
+def test_what_is_summed_by_default():
+    """L1, half of NLPD, half of HaarPSI and twice the temporal error, from image 10 on."""
+    truths, *flow = moving(13)
+    images = 0.9 * truths + 0.05 * (-1.0) ** np.arange(13, dtype=np.float32)[:, None, None, None]
+    loss, terms = sequence_loss(images, truths, *flow)
+    assert set(terms) == {"reconstruction", "l1", "nlpd", "haarpsi", "temporal"}
+    each = terms["l1"] + 0.5 * terms["nlpd"] + 0.5 * terms["haarpsi"]
+    np.testing.assert_allclose(terms["reconstruction"], each, rtol=1e-5)
+    np.testing.assert_allclose(loss, 13 * each + 2 * 3 * terms["temporal"], rtol=1e-5)
+    assert len({Loss(), Loss(), Loss(l1=0.5)}) == 2  # arguments of compiled functions
+    _, terms = sequence_loss(images, truths, *flow, replace(NOTHING, l1=1.0))
+    assert set(terms) == {"reconstruction", "l1"}  # without its weight, no temporal error
+
+
+@pytest.mark.parametrize("moved, counts", [(0.29, True), (0.31, False), (-0.31, False)])
+def test_detail_counts_up_to_three_tenths_of_a_pixel(moved, counts):
+    images, truths, displacements, visible = sequence(2)
+    displacements[:], visible[:] = moved, True
+    _, terms = sequence_loss(images, truths, displacements, visible, replace(NOTHING, detail=1.0))
+    assert bool(terms["detail"] > 0) is counts
 
 
 def test_the_first_flow_is_not_used():
@@ -219,6 +241,13 @@ def test_whether_the_state_is_warm_may_be_known_only_as_the_program_runs():
         for loss, found in (compiled(warm), sequence_loss(*arguments, settings, warm)):
             np.testing.assert_allclose(loss, expected, rtol=1e-5)
             np.testing.assert_allclose(found["temporal"], terms["temporal"], rtol=1e-5)
+
+
+def test_where_no_image_counts_yet_nothing_is_divided_by_their_number():
+    arguments, settings = sequence(3), replace(NOTHING, l1=0.3, lambda_tc=1.5, l0=7, L=9)
+    loss, terms = sequence_loss(*arguments, settings, jnp.asarray(False))
+    assert terms["temporal"] == 0
+    np.testing.assert_allclose(loss, 3 * terms["reconstruction"], rtol=1e-6)
 
 
 def test_some_sequences_may_be_warm_and_others_not():

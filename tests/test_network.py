@@ -1,3 +1,5 @@
+from dataclasses import FrozenInstanceError
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,9 +51,30 @@ def test_initial_gates_are_orthogonal_with_zero_bias():
     assert not np.asarray(gates["bias"]).any()
 
 
+def test_weights_do_not_change():
+    with pytest.raises(FrozenInstanceError):
+        Weights({}, True).normalise = False
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+def test_where_no_window_exists_the_state_stays(dtype):
+    """And where one does, it is as if nothing had been asked."""
+    params, tensors = random_run(steps=2, batch=3, height=9, width=10)
+    before, _ = step(params, initial_state(3, 9, 10), tensors[0], dtype=dtype)
+    wanted, expected = step(params, before, tensors[1], dtype=dtype)
+    exists = np.array([True, False, True])
+    after, image = step(params, before, tensors[1], jnp.asarray(exists), dtype=dtype)
+    for found, old, new in zip(after, before, wanted, strict=True):
+        assert np.abs(new - old).max() > 0.1
+        np.testing.assert_array_equal(found[1], old[1])
+        np.testing.assert_allclose(found[exists], new[exists], atol=1e-6)
+    np.testing.assert_allclose(image[exists], expected[exists], atol=1e-5)
+
+
 def test_an_untrained_network_sees_grey():
     """From black, training's first steps end with layers whose ReLU has no gradient."""
     params, state = initial_params(jax.random.key(2)), initial_state(1, 16, 16)
+    assert params["prediction"]["bias"] == 0.5
     _, image = step(params, state, jnp.zeros((1, 16, 16, 5)))
     assert abs(float(image.mean()) - 0.5) < 0.2
 

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import references
+from scipy.ndimage import convolve
 
 from firenet_jax.events import Events
 from firenet_jax.pictures import (
@@ -13,6 +14,7 @@ from firenet_jax.pictures import (
     display,
     event_pictures,
     initial_display_state,
+    unsharp_kernel,
     unsharp_mask,
 )
 from firenet_jax.tensors import pack, voxelise
@@ -23,6 +25,49 @@ def test_unsharp_mask_equals_the_5x5_kernel():
     np.testing.assert_allclose(
         unsharp_mask(jnp.asarray(image), 0.3), references.unsharp(image), atol=1e-6
     )
+
+
+@pytest.mark.parametrize("amount", [0.3, 1.0])
+def test_unsharp_mask_is_one_convolution(amount):
+    image = np.random.default_rng(0).random((14, 19)).astype(np.float32)
+    kernel = unsharp_kernel(amount)
+    assert kernel.sum() == pytest.approx(1, abs=1e-6)  # a grey picture stays as it is
+    expected = convolve(image, kernel, mode="constant")
+    np.testing.assert_allclose(unsharp_mask(jnp.asarray(image), amount), expected, atol=1e-6)
+
+
+def test_what_is_not_said_is_as_the_settings_say():
+    """Sharpened by 0.3, the automatic range, not smoothed; and 25 grey levels if smoothed."""
+    assert Display() == Display(unsharp=0.3, range="auto", bilateral=0.0)
+    assert len({Display(), Display(), Display(0)}) == 2  # arguments of a compiled function
+    images = jnp.asarray(np.random.default_rng(5).random((3, 1, 12, 14)), jnp.float32)
+    state = initial_display_state(1)
+    shown = [display(state, images, *more)[1] for more in ((), (None, Display(0.3, "auto")))]
+    np.testing.assert_array_equal(*shown)
+    np.testing.assert_array_equal(bilateral(images[0]), bilateral(images[0], 25.0))
+
+
+@pytest.mark.parametrize("height, border", [(8, 0), (9, 2)])
+def test_borders_set_no_range_where_there_is_more_than_that(height, border):
+    image = np.random.default_rng(6).random((height, 20))
+    inside = image[border : height - border, border : 20 - border]
+    low, high = np.quantile(inside, [0.005, 0.995])
+    margin = 0.05 * (high - low)
+    found = automatic_range(jnp.asarray(image, jnp.float32))
+    np.testing.assert_allclose(found, [low - margin, high + margin], atol=1e-5)
+
+
+@pytest.mark.parametrize("height, width, apart", [(127, 129, 1), (128, 128, 2), (480, 640, 8)])
+def test_the_range_is_read_from_some_4096_pixels_on_a_grid(height, width, apart):
+    """All are read below four times that; whatever lies between those that are read is not seen."""
+    y, x = np.mgrid[:height, :width] - 2
+    bright = (y % apart == 0) & (x % apart == 0)
+    low, high = automatic_range(jnp.where(bright, 1.0, 0.0))
+    assert (float(low) + float(high)) / 2 == pytest.approx(1)
+    assert float(high) - float(low) == pytest.approx(0.35)  # never narrower
+    if apart == 1:
+        bright = (y % 2 == 0) & (x % 2 == 0)
+        assert float(automatic_range(jnp.where(bright, 1.0, 0.0))[0]) == pytest.approx(-0.05)
 
 
 def test_fixed_range_clips_and_rounds():

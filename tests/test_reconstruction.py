@@ -1,4 +1,5 @@
 import re
+from functools import partial
 from typing import get_args
 
 import jax
@@ -10,12 +11,14 @@ from test_tensors import random_events
 
 from firenet_jax.checkpoint import convert
 from firenet_jax.events import Events
+from firenet_jax.instants import Step
 from firenet_jax.network import Weights, initial_params, initial_state
 from firenet_jax.pictures import Display, Range, display, initial_display_state
 from firenet_jax.reconstruction import (
     Network,
     events_to_pictures,
     initial_session,
+    looks_of,
     padding,
     reconstruct,
 )
@@ -82,6 +85,78 @@ def test_wrong_shapes_are_named():
         reconstruct(weights, initial_state(1, 8, 8), jnp.zeros((2, 8, 8, 5)))
     with pytest.raises(ValueError, match="initial_state"):
         reconstruct(weights, initial_state(1, 8, 9), jnp.zeros((2, 1, 8, 8, 5)))
+
+
+@pytest.mark.parametrize("kind, exact", [
+    ("float32", True), ("float16", True), ("bfloat16", True), ("bool", True), ("int8", True),
+    ("uint16", True), ("int32", False), ("uint32", False), ("float64", False), ("int64", False),
+])  # fmt: skip
+def test_numbers_are_taken_if_float32_holds_them_exactly(kind, exact):
+    weights, state = Weights(initial_params(jax.random.key(0)), True), initial_state(1, 8, 9)
+    with jax.enable_x64(kind.endswith("64")):
+        tensors = jax.ShapeDtypeStruct((2, 1, 8, 9, 5), kind)
+        if exact:
+            after, images = jax.eval_shape(reconstruct, weights, state, tensors)
+            assert images.dtype == after.g1.dtype == jnp.float32 and images.shape == (2, 1, 8, 9)
+        else:
+            with pytest.raises(ValueError, match=f"event tensors are of type {kind}, which"):
+                jax.eval_shape(reconstruct, weights, state, tensors)
+
+
+@pytest.mark.parametrize("valid, said", [
+    (np.ones((3, 2), bool), None), (np.ones((3, 1), bool), None), (None, None),
+    (np.ones((2, 3), bool), r"valid is \(2, 3\)"), (np.ones(3, bool), r"valid is \(3,\)"),
+    (np.ones((1, 2), bool), r"valid is \(1, 2\)"), (np.ones((3, 2)), "valid is float"),
+])  # fmt: skip
+def test_which_windows_exist_is_said_for_each_or_for_all_side_by_side(valid, said):
+    weights = Weights(initial_params(jax.random.key(0)), True)
+    arguments = weights, initial_state(2, 8, 9), jnp.zeros((3, 2, 8, 9, 5)), valid
+    if said:
+        with pytest.raises(ValueError, match=said):
+            reconstruct(*arguments)
+    else:
+        assert jax.eval_shape(reconstruct, *arguments)[1].shape == (3, 2, 8, 9)
+
+
+def test_machine_code_is_taken_unless_one_says_otherwise():
+    weights, state = Weights(initial_params(jax.random.key(0)), True), initial_state(1, 8, 9)
+
+    def has_a_choice(**choices):
+        call = partial(reconstruct, **choices)
+        return "machine_code_or_xla" in str(
+            jax.make_jaxpr(call)(weights, state, jnp.zeros((2, 1, 8, 9, 5)))
+        )
+
+    assert has_a_choice() and has_a_choice(recurrent=False)
+    assert not has_a_choice(machine_code=False)
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_the_state_that_is_passed_stays_as_it_is(steps):
+    """So the same windows can be seen again from there."""
+    params, tensors = random_run(steps=steps, batch=1)
+    weights = Weights(params, True)
+    state, _ = reconstruct(weights, initial_state(1, 23, 31), tensors)
+    before = np.array(state.g1), np.array(state.g2)
+    runs = [reconstruct(weights, state, tensors) for _ in range(2)]
+    np.testing.assert_array_equal(runs[0][1], runs[1][1])
+    for kept, now in zip(before, state, strict=True):
+        np.testing.assert_array_equal(kept, now)
+
+
+def test_how_the_network_runs_if_nothing_is_said():
+    assert Network() == Network(recurrent=True, bfloat16=False, pad=1, color=False)
+    assert len({Network(), Network(), Network(pad=2)}) == 2  # arguments of a compiled function
+
+
+def test_looks_of_recordings_side_by_side():
+    """What is missing counts as kept, from the last state alone."""
+    nothing = Events.empty()
+    one = [Step(nothing, None, 1.0), Step(nothing, 30, 0.25), Step(nothing, 40, 0.5)]
+    looks, share = looks_of([one, [], [Step(nothing, 7, 0.75)]], 4)
+    assert looks.dtype == bool and share.dtype == np.float32
+    assert looks.T.tolist() == [[False, True, True, False], [False] * 4, [True] + [False] * 3]
+    assert share.T.tolist() == [[1, 0.25, 0.5, 1], [1] * 4, [0.75, 1, 1, 1]]
 
 
 def test_works_inside_a_users_jit_and_vmap():
@@ -211,3 +286,8 @@ def test_pictures_are_cut_out_of_the_reflected_ones(pad, above, below, left, rig
     whole = np.asarray(display(initial_display_state(1), images)[1])
     expected = whole[..., above : above + 19, left : left + 23]
     assert np.abs(np.asarray(found, int) - expected).max() <= 1
+    _, found = events_to_pictures(
+        weights, session, packed, valid, height=19, width=23, network=network, raw=True
+    )
+    expected = images[..., above : above + 19, left : left + 23]
+    np.testing.assert_allclose(found, expected, atol=2e-5)

@@ -209,6 +209,15 @@ def test_times_that_do_not_advance_are_refused():
             list(event_list(plain_sensor(), [(5, image), (second, image)]))
 
 
+def test_an_interval_may_be_as_long_as_its_ticks_can_be_counted():
+    """Two seconds: a steady rise over 20.5 thresholds, whose last stamp is near the end."""
+    assert TICKS * MAX_INTERVAL + TICKS // 2 < 2**31 <= TICKS * (MAX_INTERVAL + 1)
+    levels = np.broadcast_to(np.array([-5.0, -5.0 + 20.5 * 0.2])[:, None, None], (2, 1, 1))
+    events = listed(plain_sensor(), [7, 7 + MAX_INTERVAL], levels)
+    expected = 7 + np.arange(1, 21) / 20.5 * MAX_INTERVAL
+    np.testing.assert_allclose(events.t, expected, atol=3)
+
+
 def test_large_times_lose_no_microsecond():
     """Two days into a recording the stamps are those of its beginning."""
     times = np.arange(0, 100_000, 1000)
@@ -306,6 +315,121 @@ def test_faults_are_switched_on_but_what_is_given_stays():
 def test_impossible_sensors(choice, message):
     with pytest.raises(ValueError, match=message):
         SensorSettings(**choice)
+
+
+@pytest.mark.parametrize(
+    "choice",
+    [{"hot": (0.5, 1.0)}, {"flicker": (0.5, 1.0)}, {"clean": 1.0}, {"clean": 0.0},
+     {"refractory": MAX_INTERVAL * 1e-6}, {"refractory_range": (1e-3, MAX_INTERVAL * 1e-6)},
+     {"refractory": 0.0}, {"mismatch": 0.0}, {"cutoff_dark": 0.0}, {"asymmetry": 0.0},
+     {"threshold_spread": 0.0}, {"noise": (2.0, 2.0)}, {"noise": [0, 0], "leak": (0.0, 0.0)},
+     {"hot": 0, "cutoff": 0, "flicker": 0}, {"threshold_range": (0.1, 0.2), "asymmetry": 0.3}],
+)  # fmt: skip
+def test_sensors_at_the_edge_of_what_can_be(choice):
+    assert replace(SensorSettings(), **choice) == SensorSettings(**choice)
+
+
+@pytest.mark.parametrize(
+    "choice, message",
+    [
+        ({"refractory": MAX_INTERVAL * 1.1e-6}, "at most 2.1 s"),
+        ({"refractory_range": (1e-3, MAX_INTERVAL * 1.1e-6)}, "at most 2.1 s"),
+        ({"clean": -0.1}, "clean is -0.1"), ({"clean": 1.1}, "clean is 1.1"),
+        ({"threshold": 0.0}, "threshold is 0"), ({"cutoff_dark": -0.1}, "cutoff_dark is"),
+        ({"hot": (0.5, 1.01)}, "part of the pixels"), ({"flicker": (0.5, 1.01)}, "at most 1"),
+        ({"threshold_spread": 0.1, "threshold_range": (0.1, 0.6)}, "pass --asymmetry"),
+    ],
+)  # fmt: skip
+def test_sensors_beyond_the_edge(choice, message):
+    with pytest.raises(ValueError, match=message):
+        SensorSettings(**choice)
+
+
+def test_the_sensor_if_nothing_is_said():
+    """As `--help` says of it; and with all faults, as strong as in real sensors."""
+    plain = SensorSettings()
+    assert (plain.asymmetry, plain.cutoff_dark, plain.clean) == (0.1, 0.1, 0.0)
+    assert plain.mid_recording is False and len({plain, SensorSettings(), FAULTY}) == 2
+    sensor = random_sensor(jax.random.key(0), height=2, width=3)
+    assert sensor.refractory == 1000 * TICKS and sensor.start is sensor.lamp is None
+    bare = random_sensor(
+        jax.random.key(0), height=2, width=3, settings=replace(plain, refractory=0.0)
+    )
+    assert bare.refractory is None and bare.on == sensor.on
+    assert with_faults(plain) == FAULTY
+    ranges = FAULTY.refractory_range, FAULTY.noise, FAULTY.leak, FAULTY.hot, FAULTY.cutoff
+    assert ranges == ((1e-4, 1e-3), (0.1, 10.0), (0.01, 0.5), (1e-4, 1e-3), (100.0, 1000.0))
+    assert FAULTY.mismatch == 0.03 and FAULTY.flicker is None
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """2000 small sensors with every fault."""
+    settings = SensorSettings(
+        threshold_range=(0.1, 0.4), asymmetry=0.2, refractory_range=(1e-4, 1e-2),
+        noise=(0.1, 10.0), noise_in_light=(0.01, 0.5), leak=(0.01, 0.5), cutoff=(100.0, 1000.0),
+        flicker=(0.05, 0.9),
+    )  # fmt: skip
+    draw = partial(random_sensor, height=2, width=3, settings=settings)
+    return jax.device_get(jax.jit(jax.vmap(draw))(jax.random.split(jax.random.key(0), 2000)))
+
+
+def numbers_of(drawn):
+    """What is drawn once for each sensor, in logarithms, and where it lies."""
+    lamp, log = drawn.lamp, np.log
+    # -((y - row)^2 + (x - column)^2) / reach^2, where y is 0 and 1/3, and x 0, 1/3 and 2/3
+    swing = log(np.float64(lamp.swing))
+    reach = np.sqrt(-2 / 9 / np.diff(swing, 2, axis=2)[:, 0, 0])
+    down, across = swing[:, 1, 0] - swing[:, 0, 0], swing[:, 0, 2] - swing[:, 0, 0]
+    row, column = (down * reach**2 + 1 / 9) * 3 / 2, (across * reach**2 + 4 / 9) * 3 / 4
+    peak = swing[:, 0, 0] + (row**2 + column**2) / reach**2
+    return {
+        "on": (log(drawn.on), log(0.1), log(0.4)),
+        "refractory": (log(drawn.refractory / (1e6 * TICKS)), log(1e-4), log(1e-2)),
+        "noise": (log(drawn.noise[:, 0]), log(0.1), log(10.0)),
+        "light": (drawn.noise_slope, log(0.01), log(0.5)),
+        "leak": (log(drawn.drift[:, 0, 0] / drawn.on), log(0.01), log(0.5)),
+        "cutoff": (log(drawn.cutoff[:, 0]), log(100.0), log(1000.0)),
+        "hertz": (log(lamp.hertz), log(60.0), log(240.0)),
+        "start": (lamp.start, 0.0, 1.0),
+        "reach": (log(reach), log(0.15), log(2.0)),
+        "swing": (peak, log(0.05), log(0.9)),
+        "row": (row, 0.0, 1 / 3),
+        "column": (column, 0.0, 2 / 3),
+    }
+
+
+def test_what_is_drawn_fills_its_range_and_nothing_goes_along_with_another(drawn):
+    numbers = numbers_of(drawn)
+    for name, (values, least, greatest) in numbers.items():
+        share = (values - least) / (greatest - least)
+        assert -0.01 < share.min() < 0.02 and 0.98 < share.max() < 1.01, name
+        assert abs(share.mean() - 0.5) < 0.04, name
+    correlations = np.corrcoef([values for values, _, _ in numbers.values()])
+    assert np.abs(correlations - np.eye(len(numbers))).max() < 0.1
+
+
+def test_hot_pixels_fire_at_ten_to_five_hundred_hertz_on_or_off():
+    settings = SensorSettings(threshold_range=(0.2, 0.2), asymmetry=0.5, hot=(0.3, 0.3))
+    sensor = random_sensor(jax.random.key(1), height=100, width=100, settings=settings)
+    drift, hot = np.asarray(sensor.drift), np.asarray(sensor.drift != 0)
+    assert abs(hot.mean() - 0.3) < 0.02 and abs((drift[hot] > 0).mean() - 0.5) < 0.05
+    rates = np.where(drift > 0, drift / sensor.on, -drift / sensor.off)[hot]
+    assert 10 <= rates.min() < 10.2 and 490 < rates.max() <= 500.01
+    assert abs(np.log(rates).mean() - np.log(10 * 500) / 2) < 0.1
+
+
+def test_drifting_pixels_begin_anywhere_and_half_of_all_with_a_noise_event_on():
+    """Where L rises they are above the reference, where it sinks below, and the others on it."""
+    shape, phase = (200, 200), jax.random.uniform(jax.random.key(2), (200, 200))
+    drift = jnp.broadcast_to(jnp.array([1.0, -1.0, 0.0, 2.0])[None].repeat(50, 1), shape)
+    sensor = plain_sensor()._replace(drift=drift, phase=phase, noise=jnp.array([1.0, 0.25, 0.0]))
+    state = module.first_state(sensor, jnp.full(shape, 0.5))
+    expected = np.select([drift > 0, drift < 0], [0.2 * phase, -0.17 * phase], 0)
+    np.testing.assert_allclose(state.above, expected, atol=1e-6)
+    on = np.asarray(state.noise_on, float)
+    assert abs(on.mean() - 0.5) < 0.02
+    assert abs(np.corrcoef(on.ravel(), np.asarray(phase).ravel())[0, 1]) < 0.02
 
 
 def test_a_still_scene_is_silent_without_faults():
@@ -646,6 +770,9 @@ def test_a_clean_sensor_among_faulty_ones_is_the_papers(textures):
     faulty = jax.jit(jax.vmap(partial(make, settings=replace(settings, clean=0.0))))(keys)
     clean = np.asarray(sensors.noise[:, 0]) == 0
     assert 0.4 < clean.mean() < 0.6
+    assert (np.asarray(sensors.refractory)[clean] == 1000 * TICKS).all()
+    assert (np.asarray(sensors.noise)[clean] == [0, 0.25, 0]).all()
+    assert (np.asarray(sensors.cutoff)[clean][:, 1] == 1).all()
     for name in ("on", "off", "refractory", "drift", "noise", "cutoff"):
         mixed, usual = (np.asarray(getattr(s, name)) for s in (sensors, faulty))
         np.testing.assert_array_equal(mixed[~clean], usual[~clean])

@@ -14,11 +14,12 @@ import references
 
 from firenet_jax import tensors
 from firenet_jax.errors import SettingsError
-from firenet_jax.events import Events
+from firenet_jax.events import Events, Recording
 from firenet_jax.tensors import (
     BLOCK,
     CAPACITIES,
     capacity,
+    event_tensors,
     normalise,
     pack,
     pack_for_devices,
@@ -102,6 +103,15 @@ def test_a_window_longer_than_int32_microseconds():
     np.testing.assert_allclose(tensors[1], references.event_tensor(short, 12, 17), atol=1e-5)
 
 
+@pytest.mark.parametrize("span", [2**31 - 1, 2**31, 2**31 + 1, 2**32 - 1, 2**32, 3 * 2**40 + 1])
+def test_windows_about_as_long_as_int32_counts(span):
+    t = 10**15 + np.array([0, span // 5, span // 2, span - span // 3, span])
+    events = Events.of(t, range(5), range(5), [1, 0, 1, 1, 0])
+    np.testing.assert_allclose(
+        tensor_of(events), references.event_tensor(events, 12, 17), atol=1e-5
+    )
+
+
 def test_times_beyond_int32_lose_no_microsecond():
     """As float32 seconds all these times would be one."""
     start = 1_700_000_000_000_000
@@ -125,6 +135,16 @@ def test_normalise_equals_numpy_and_ignores_scale():
 def test_normalise_of_constant_and_empty_windows_is_zero():
     constant = jnp.zeros((2, 12, 17, 5)).at[0, 3, 3:9, 0].set(2.0)
     assert not np.asarray(normalise(constant)).any()
+
+
+@pytest.mark.parametrize("deviation, zero", [(0.9e-6, True), (1.1e-6, False), (1e-3, False)])
+def test_normalise_takes_a_deviation_below_a_millionth_for_none(deviation, zero):
+    signs = np.sign(np.random.default_rng(0).normal(size=(6, 7, 5)))
+    signs[0] = 0
+    found = np.asarray(normalise(jnp.float32(deviation / signs[1:].std() * signs)))
+    assert not found[0].any()
+    expected = 0 if zero else (signs[1:] - signs[1:].mean()) / signs[1:].std()
+    np.testing.assert_allclose(found[1:], np.broadcast_to(expected, found[1:].shape), atol=1e-3)
 
 
 def test_normalise_at_sensor_size_in_float32():
@@ -167,6 +187,18 @@ def test_capacities_only_grow_and_are_few():
     assert capacity(2**23 + 1) == 2**24  # memory counts there, so not 8 times as many
     with pytest.raises(ValueError, match="do not fit"):
         pack([[random_events(np.random.default_rng(0), 10)]], size=9)
+    # up to 8 times as many as needed at first, from a million on at most twice
+    assert [capacity(n) for n in (0, 2**14, 2**14 + 1, 2**17 + 1)] == [2**14, 2**14, 2**17, 2**20]
+    assert [capacity(2**k) for k in range(20, 31)] == [2**k for k in range(20, 31)]
+    assert capacity(2**30 + 1) == 3 * 2**29
+
+
+def test_there_may_be_fewer_than_32768_windows_at_once():
+    """Their numbers are int16, and one more is that of what is not used."""
+    most = pack([[Events.empty()] * 7] * 4681)
+    assert most.t_min.shape == (4681, 7) and (most.window == 2**15 - 1).all()
+    with pytest.raises(SettingsError, match="fewer than 32768 windows at once"):
+        pack([[Events.empty()] * 8] * 4096)
 
 
 @pytest.mark.parametrize("rows", [[], [[]], [[Events.empty()], [Events.empty()] * 2]])
@@ -220,10 +252,16 @@ def test_a_list_is_summed_block_by_block():
         assert f" length={blocks} " in str(program).replace("\n", " "), (size, blocks)
 
 
-def test_lists_are_aligned():
+@pytest.mark.parametrize("size", [10, 31, 33, None])
+def test_lists_are_aligned(size):
     """XLA copies what is not."""
-    packed = pack([[random_events(np.random.default_rng(12), 10)]])
+    events = random_events(np.random.default_rng(12), 10)
+    packed = pack([[events]], size)
     assert [column.ctypes.data % 64 for column in packed[:5]] == [0] * 5
+    assert {len(column) for column in packed[:5]} == {size or CAPACITIES[0]}
+    for name in "xyp":
+        np.testing.assert_array_equal(getattr(packed, name)[:10], getattr(events, name))
+    assert (packed.window[:10] == 0).all() and (packed.window[10:] == 1).all()
 
 
 def test_a_long_list_is_not_given_away_before_its_times_are_there(monkeypatch):
@@ -251,3 +289,43 @@ def test_lists_for_devices_hold_their_recordings():
             np.testing.assert_array_equal(ours[k * size :][:size][used], theirs[used])
         for ours, theirs in zip(both[5:], alone[5:], strict=True):
             np.testing.assert_array_equal(ours[:, 2 * k :][:, :2], theirs)
+
+
+def recording_of(windows, size=7):
+    """Of these numbers of events, a millisecond each window, in chunks of any size."""
+    t = np.concatenate([1000 * k + np.linspace(0, 999, n) for k, n in enumerate(windows)])
+    rng = np.random.default_rng(0)
+    events = Events.of(
+        t.astype(np.int64), *rng.integers(0, [[17], [12]], (2, len(t))), rng.random(len(t)) < 0.5
+    )
+    chunks = [events.select(slice(k, k + size)) for k in range(0, len(t), size)]
+    return Recording("memory", "memory", 12, 17, lambda: iter(chunks)), events
+
+
+@pytest.mark.parametrize("chunk, lengths", [(1, [1] * 10), (4, [4, 4, 2]), (None, [8, 2])])
+def test_a_recording_becomes_chunks_of_tensors_with_the_times_of_their_ends(chunk, lengths):
+    counts = [30, 20, 0, 10, 25, 5, 40, 3, 2, 8]
+    recording, events = recording_of(counts)
+    chosen = {} if chunk is None else {"chunk": chunk}
+    found = list(event_tensors(recording, duration=1, **chosen))
+    assert [tensors.shape for tensors, _ in found] == [(n, 1, 12, 17, 5) for n in lengths]
+    ends = np.cumsum(counts)
+    times = np.concatenate([times for _, times in found])
+    assert times.dtype == np.int64
+    assert times.tolist() == [events.t[e - 1] if n else 3000 for e, n in zip(ends, counts)]  # noqa: B905
+    tensors = np.concatenate([tensors for tensors, _ in found])[:, 0]
+    for tensor, end, count in zip(tensors, ends, counts, strict=True):
+        window = events.select(slice(end - count, end))
+        np.testing.assert_allclose(tensor, references.event_tensor(window, 12, 17), atol=1e-5)
+
+
+def test_a_chunk_holds_a_window_at_least():
+    with pytest.raises(ValueError, match="chunk is 0, but must be 1 or more"):
+        next(event_tensors(recording_of([5])[0], chunk=0))
+
+
+def test_after_a_chunk_of_many_events_one_of_few_does_not_recompile():
+    recording, _ = recording_of([CAPACITIES[0] + 1, 10, 20], size=1000)
+    voxelise.clear_cache()
+    assert len(list(event_tensors(recording, duration=1, chunk=1))) == 3
+    assert voxelise._cache_size() == 1
