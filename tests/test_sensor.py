@@ -17,6 +17,7 @@ from firenet_jax.simulation.scenes import SceneSettings, rendering_times, video
 from firenet_jax.simulation.sensor import (
     EPS,
     FAULTY,
+    FLICKER_INTERVAL,
     MAX_INTERVAL,
     TICKS,
     Sensor,
@@ -218,6 +219,19 @@ def test_an_interval_may_be_as_long_as_its_ticks_can_be_counted():
     np.testing.assert_allclose(events.t, expected, atol=3)
 
 
+def test_an_interval_may_be_as_short_as_a_microsecond():
+    image = np.full((2, 2), 0.1, np.float32)
+    (events,) = event_list(plain_sensor(), [(5, image), (6, 1.3 * image)])
+    assert len(events) == 4 and set(events.t) <= {5, 6}
+
+
+def test_stamps_are_rounded_to_the_nearest_microsecond():
+    ticks = np.arange(5000)
+    expected = np.floor(ticks / 1024 + 0.5)
+    np.testing.assert_array_equal(module._stamps(ticks, 0, 3), expected)
+    np.testing.assert_array_equal(module._stamps(ticks - 3 * 700, 700, 3), expected)
+
+
 def test_large_times_lose_no_microsecond():
     """Two days into a recording the stamps are those of its beginning."""
     times = np.arange(0, 100_000, 1000)
@@ -268,6 +282,7 @@ def test_wide_thresholds_and_mismatch(asymmetry):
     )
     assert own.on.shape == own.off.shape == (80, 90)
     assert abs(np.std(own.on) - 0.03) < 0.001 and own.on.min() >= 0.01
+    assert abs(np.corrcoef(own.on.ravel(), own.off.ravel())[0, 1]) < 0.05
 
 
 def test_in_the_middle_of_a_recording_references_are_anywhere_within_a_threshold():
@@ -348,6 +363,8 @@ def test_sensors_beyond_the_edge(choice, message):
 def test_the_sensor_if_nothing_is_said():
     """As `--help` says of it; and with all faults, as strong as in real sensors."""
     plain = SensorSettings()
+    assert (EPS, TICKS) == (0.001, 1024)
+    assert 1e6 / 240 / FLICKER_INTERVAL == pytest.approx(25 / 3)  # of the fastest lamp's period
     assert (plain.asymmetry, plain.cutoff_dark, plain.clean) == (0.1, 0.1, 0.0)
     assert plain.mid_recording is False and len({plain, SensorSettings(), FAULTY}) == 2
     sensor = random_sensor(jax.random.key(0), height=2, width=3)
@@ -522,6 +539,20 @@ def test_bandwidth_lets_slow_changes_pass_and_holds_fast_ones_back():
     # In the dark it is slower, where the setting says so.
     dark = with_only(6, cutoff=(100.0, 100.0), cutoff_dark=0.1, refractory=1e-6)
     assert at_pixel(listed(dark, times, logs), 0, 0)[0][0] > 1.5 * t[0]
+
+
+@pytest.mark.parametrize(
+    "before, light, dark", [(0.05, 0.3, 0.2), (0.9, 0.0, 0.1), (0.1, 1.0, 0.5)]
+)
+def test_bandwidth_grows_with_light(before, light, dark):
+    """From what it is in the dark to 100 Hz; what is left of a step falls exponentially."""
+    sensor = plain_sensor()._replace(cutoff=jnp.array([100.0, dark]))
+    state = module.first_state(sensor, jnp.full((1, 1), before))
+    state, _ = module.step(sensor, state, jnp.full((1, 1), light), jnp.int32(2000))
+    hertz = 100 * (dark + light * (1 - dark))
+    start, end = np.log(0.001 + before), np.log(0.001 + light)
+    expected = end + (start - end) * np.exp(-2 * np.pi * hertz * 0.002)
+    np.testing.assert_allclose(state.log, expected, rtol=1e-4)
 
 
 def test_a_lamp_fires_where_its_light_crosses_thresholds_and_falls_off_around_a_place():
