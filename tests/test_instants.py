@@ -1,6 +1,7 @@
 """Steps against a slow list of what each must hold; images against single steps of the network."""
 
 import itertools
+from functools import partial
 
 import jax
 import numpy as np
@@ -12,7 +13,17 @@ from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Recording
 from firenet_jax.instants import Counts, Grid, grid, steps, warming
 from firenet_jax.network import Weights, initial_params, initial_state, step
-from firenet_jax.reconstruction import Committed, Looks, images_at, reconstruct, reconstruct_at
+from firenet_jax.pictures import display, initial_display_state
+from firenet_jax.reconstruction import (
+    Committed,
+    Looks,
+    Network,
+    events_to_pictures,
+    images_at,
+    initial_session,
+    reconstruct,
+    reconstruct_at,
+)
 from firenet_jax.tensors import normalise, pack, voxelise
 from firenet_jax.windows import Window, Windows, cut
 
@@ -310,6 +321,39 @@ def test_steps_that_are_all_kept_are_those_of_reconstruct(weights):
         )
         np.testing.assert_allclose(images, wanted, atol=1e-6)
         np.testing.assert_allclose(after.last.g2, state.g2, atol=1e-6)
+
+
+@pytest.mark.parametrize("recurrent, pad", [(True, 2), (False, 1)])
+def test_pictures_of_looks_are_those_of_their_images(recurrent, pad):
+    """Tensors are normalised, then padded; of what is kept the range of the display knows nothing."""
+    rng = np.random.default_rng(5)
+    height, width = 11, 17
+    rows = [[random_events(rng, n, height, width) for n in (80, 150)] for _ in range(5)]
+    looks, share = rng.random((5, 2)) < 0.6, rng.random((5, 2)).astype(np.float32)
+    valid = np.arange(5)[:, None] < [5, 4]
+    weights = Weights(initial_params(jax.random.key(1)), True)
+    network = Network(recurrent=recurrent, pad=pad)
+    session = initial_session(2, height, width, network, at_times=True)
+    call = partial(
+        events_to_pictures, weights, session, pack(rows), valid, Looks(looks, share),
+        height=height, width=width, network=network,
+    )  # fmt: skip
+    tensors = normalise(voxelise(pack(rows), height=height, width=width))
+    padded = np.pad(tensors, ((0, 0), (0, 0), *[(pad - 1, 0)] * 2, (0, 0)), "reflect")
+    zero = initial_state(2, *padded.shape[2:4])
+    plain = Weights(weights.params, normalise=False)
+    after, images = reconstruct_at(
+        plain, Committed(zero, zero), padded, Looks(looks, share), valid, recurrent=recurrent
+    )
+    shown = display(initial_display_state(2), images, valid & looks)[1]
+    seen = valid & looks
+    assert seen.sum() >= 4
+    for raw, expected, atol in ((False, shown, 1), (True, images, 2e-5)):
+        found_session, found = call(raw=raw)
+        expected = np.asarray(expected, float)[:, :, pad - 1 :, pad - 1 :]
+        np.testing.assert_allclose(np.float64(found)[seen], expected[seen], atol=atol)
+        for ours, theirs in zip(found_session.network.last, after.last, strict=True):
+            np.testing.assert_allclose(ours, theirs, atol=2e-5)
 
 
 def test_nothing_recompiles_as_data_flows(weights, recording):
