@@ -325,7 +325,7 @@ def test_steps_that_are_all_kept_are_those_of_reconstruct(weights):
 
 @pytest.mark.parametrize("recurrent, pad", [(True, 2), (False, 1)])
 def test_pictures_of_looks_are_those_of_their_images(recurrent, pad):
-    """Tensors are normalised, then padded; of what is kept the range of the display knows nothing."""
+    """Tensors are normalised, then padded; the display forgets the images of what is kept."""
     rng = np.random.default_rng(5)
     height, width = 11, 17
     rows = [[random_events(rng, n, height, width) for n in (80, 150)] for _ in range(5)]
