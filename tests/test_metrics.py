@@ -394,6 +394,8 @@ def test_event_correlation_equals_least_squares_block_by_block():
     assert np.isfinite(flat(np.zeros_like(image))).all() and np.isfinite(flat(image)).all()
     actual = metrics.event_correlation(np.stack([image, 1 - 3 * image]), np.stack([votes] * 2))
     np.testing.assert_allclose(actual, (fit / total) ** 0.5, rtol=1e-3)
+    faint = metrics.event_correlation(np.stack([image] * 2), 1e-3 * np.stack([votes, -votes]))
+    np.testing.assert_allclose(faint, (fit / total) ** 0.5, rtol=1e-3)
 
 
 def test_event_correlation_prefers_the_image_that_moved():

@@ -752,6 +752,18 @@ def test_denser_renderings_give_the_same_events(scenes):
     assert np.abs(counts[0] - counts[1]).mean() < 0.05 * counts[1].mean()
 
 
+def test_no_vote_is_lost_however_many_renderings_a_window_has(textures):
+    """The votes of each event add up to 1: those of a pixel to a whole number."""
+    size = {"height": 16, "width": 18}
+    settings = SETTINGS | size | {"batch": 1, "renderings": 5, "sensor": SensorSettings()}
+    sensors, scenes, durations = random_setups(jax.random.key(2), textures, **settings)
+    bounds = window_bounds(durations, 2)
+    _, made = simulate(sensors, scenes, bounds, renderings=3, **size)
+    sums = np.asarray(made.tensors.sum(-1))
+    np.testing.assert_allclose(sums, np.round(sums), atol=1e-3)
+    assert np.abs(sums).sum() > 50
+
+
 def test_the_runs_of_given_pictures_vote_as_their_events_do():
     """The same pictures for both outputs: nothing but the stamps' last bits may differ."""
     sensor = random_sensor(jax.random.key(9), height=H, width=W, settings=FAULTY)

@@ -227,6 +227,14 @@ def test_between_frames_needs_frames():
         cut(recording_of(range(9)), Windows(frame_to_frame=True))
 
 
+@pytest.mark.parametrize(
+    "windows",
+    [{"events": 4}, {"events": 4, "step": 2}, {"events": 4, "longest": 9}, {"duration": 1}],
+)
+def test_one_event_is_one_window(windows):
+    assert times_of(recording_of([5]), **windows) == [[5]]
+
+
 def test_no_events_no_windows():
     for windows in (Windows(), Windows(duration=1)):
         assert list(cut(recording_of([]), windows)) == []
