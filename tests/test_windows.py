@@ -231,8 +231,8 @@ def test_between_frames_needs_frames():
     "windows",
     [{"events": 4}, {"events": 4, "step": 2}, {"events": 4, "longest": 9}, {"duration": 1}],
 )
-def test_one_event_is_one_window(windows):
-    assert times_of(recording_of([5]), **windows) == [[5]]
+def test_one_event_is_one_window(choice):
+    assert times_of(recording_of([5]), **choice) == [[5]]
 
 
 def test_no_events_no_windows():
