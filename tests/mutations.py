@@ -97,6 +97,14 @@ _also("reconstruction.py", "no type of numbers lies between",
       "exact = kind == jnp.bool_ or (whole and jnp.iinfo(kind).max < 2**24)",
       "exact = kind == jnp.bool_ or (whole and jnp.iinfo(kind).max <= 2**25)",
       )  # fmt: skip
+_also("reconstruction.py", "only shapes are taken from them",
+      "shapes = jax.eval_shape(initial_params, jax.random.key(1))")  # fmt: skip
+_also("reconstruction.py", "nothing is asked of the state after the last step",
+      "looks, valid = looks_of([group], chunk), np.arange(chunk)[:, None] <= len(group)",
+      )  # fmt: skip
+_also("pictures.py", "what is padded farther is not read", "padding[axis] = (2, 3)",
+      'padded = jnp.pad(images, [(0, 0)] * (images.ndim - 2) + [(2, 3)] * 2, mode="reflect")',
+      )  # fmt: skip
 _also("evaluation/metrics.py", "the lengths are equal",
       "for a, b in zip(_haar(image), _haar(truth), strict=False):  # two orientations",
       "pairs = zip(bands(image), bands(truth), strict=False)",

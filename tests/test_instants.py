@@ -323,22 +323,23 @@ def test_steps_that_are_all_kept_are_those_of_reconstruct(weights):
         np.testing.assert_allclose(after.last.g2, state.g2, atol=1e-6)
 
 
-@pytest.mark.parametrize("recurrent, pad", [(True, 2), (False, 1)])
-def test_pictures_of_looks_are_those_of_their_images(recurrent, pad):
+@pytest.mark.parametrize("recurrent, pad, wanted", [(True, 2, True), (False, 1, False)])
+def test_pictures_of_looks_are_those_of_their_images(recurrent, pad, wanted):
     """Tensors are normalised, then padded; the display forgets the images of what is kept."""
     rng = np.random.default_rng(5)
     height, width = 11, 17
     rows = [[random_events(rng, n, height, width) for n in (80, 150)] for _ in range(5)]
     looks, share = rng.random((5, 2)) < 0.6, rng.random((5, 2)).astype(np.float32)
     valid = np.arange(5)[:, None] < [5, 4]
-    weights = Weights(initial_params(jax.random.key(1)), True)
+    weights = Weights(initial_params(jax.random.key(1)), normalise=wanted)
     network = Network(recurrent=recurrent, pad=pad)
     session = initial_session(2, height, width, network, at_times=True)
     call = partial(
         events_to_pictures, weights, session, pack(rows), valid, Looks(looks, share),
         height=height, width=width, network=network,
     )  # fmt: skip
-    tensors = normalise(voxelise(pack(rows), height=height, width=width))
+    tensors = voxelise(pack(rows), height=height, width=width)
+    tensors = normalise(tensors) if wanted else tensors
     padded = np.pad(tensors, ((0, 0), (0, 0), *[(pad - 1, 0)] * 2, (0, 0)), "reflect")
     zero = initial_state(2, *padded.shape[2:4])
     plain = Weights(weights.params, normalise=False)
@@ -356,6 +357,17 @@ def test_pictures_of_looks_are_those_of_their_images(recurrent, pad):
             np.testing.assert_allclose(ours, theirs, atol=2e-5)
 
 
+def test_bfloat16_is_close_at_given_times_too(weights):
+    tensors = np.random.default_rng(6).normal(size=(2, 1, HEIGHT, WIDTH, 5)).astype(np.float32)
+    zero = initial_state(1, HEIGHT, WIDTH)
+    looks = Looks(np.array([[False], [True]]), np.ones((2, 1), np.float32))
+    exact, rough = (
+        reconstruct_at(weights, Committed(zero, zero), tensors, looks, dtype=dtype)[1]
+        for dtype in (np.float32, jax.numpy.bfloat16)
+    )
+    assert 1e-4 < np.abs(exact - rough).max() < 0.05
+
+
 def test_nothing_recompiles_as_data_flows(weights, recording):
     reconstruct_at.clear_cache()
     voxelise.clear_cache()
@@ -369,7 +381,8 @@ def test_seconds_are_no_times(weights, recording, caplog):
         with pytest.raises(ValueError, match="whole microseconds"):
             list(images_at(weights, recording, times))
     assert len(list(images_at(weights, recording, np.array([float(FIRST)])))) == 1
-    assert not caplog.text
+    assert len(list(images_at(weights, recording, [0, FIRST, 2**60]))) == 1
+    assert not caplog.text  # where some are outside and some are not
     assert not list(images_at(weights, recording, [0, 2**60]))
     assert "1 before its first event, 1 after its last one" in caplog.text
 

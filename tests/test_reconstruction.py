@@ -83,6 +83,8 @@ def test_wrong_shapes_are_named():
     weights = Weights(initial_params(jax.random.key(0)), True)
     with pytest.raises(ValueError, match=r"event tensors are \(T, B, H, W, 5\)"):
         reconstruct(weights, initial_state(1, 8, 8), jnp.zeros((2, 8, 8, 5)))
+    with pytest.raises(ValueError, match=r"event tensors are \(T, B, H, W, 5\)"):
+        reconstruct(weights, initial_state(1, 8, 8), jnp.zeros((2, 1, 8, 8, 4)))
     with pytest.raises(ValueError, match="initial_state"):
         reconstruct(weights, initial_state(1, 8, 9), jnp.zeros((2, 1, 8, 8, 5)))
 
@@ -237,17 +239,20 @@ def test_accelerators_normalise_all_windows_at_once_and_cpus_one_by_one():
     """What a program is for decides, not what this machine has."""
     weights = Weights(initial_params(jax.random.key(0)), True)
     packed = pack([[random_events(np.random.default_rng(t), 50, 8, 9)] for t in range(3)])
-    arguments = weights, initial_session(1, 8, 9, Network()), packed, np.ones((3, 1), bool)
-    traced = events_to_pictures.trace(*arguments, height=8, width=9)
+    more = initial_session(1, 8, 9, Network()), packed, np.ones((3, 1), bool)
+    size = {"height": 8, "width": 9}
+    programs = {w: events_to_pictures.trace(Weights(weights.params, w), *more, **size)
+                for w in (True, False)}  # fmt: skip
 
-    def roots(platform):
+    def roots(platform, wanted=True):
         """How many axes what a root is taken of has: (T, B, 1, 1, 1) or (B, 1, 1, 1)."""
-        text = traced.lower(lowering_platforms=(platform,)).as_text()
+        text = programs[wanted].lower(lowering_platforms=(platform,)).as_text()
         found = re.findall(r"stablehlo.r?sqrt .*tensor<((?:\d+x)+)f32>", text)
         return {sizes.count("x") for sizes in found}
 
     assert 5 in roots("cuda") and 4 not in roots("cuda")
     assert 5 not in roots("cpu")
+    assert not roots("cuda", wanted=False) & {4, 5}  # nor where nothing is to be normalised
 
 
 def test_the_pictures_network_runs_as_it_is_told():

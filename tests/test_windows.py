@@ -228,7 +228,7 @@ def test_between_frames_needs_frames():
 
 
 @pytest.mark.parametrize(
-    "windows",
+    "choice",
     [{"events": 4}, {"events": 4, "step": 2}, {"events": 4, "longest": 9}, {"duration": 1}],
 )
 def test_one_event_is_one_window(choice):
