@@ -122,13 +122,37 @@ _also("evaluation/metrics.py", "both sides are equal there",
       "some = q >= 1e-6  # otherwise both images are black, and so equal",
       )  # fmt: skip
 _also("evaluation/metrics.py", "a part is at most 1", "return root(jnp.clip(part, 0.0, 1.6))")
+_also("network.py", "JAX takes the last for one beyond it",
+      "return State(g1, g2), self.prediction(x)[..., 1]")  # fmt: skip
+_also("checkpoint.py", "the lengths are equal",
+      "for source, kernel, bias in zip(sources, kernels, biases, strict=False):")  # fmt: skip
+_also("training/losses.py", "a tenth of a pixel is as good as none",
+      "moved = jnp.where(visible, jnp.abs(displacements).max(-1), 0.1).max((-2, -1))",
+      )  # fmt: skip
+_also("simulation/curricula.py", "where there are none, their motion is not used",
+      "pixels = jnp.where(is_slow, log_uniform(SLOW, kind / (slow or 2)), pixels)",
+      "pixels = jnp.where(is_swift, log_uniform(SWIFT, (kind - 1 + swift) / (swift or 2)), pixels)",
+      "pixels = log_uniform(motion, jnp.clip((kind - slow) / (1 - slow - swift), 0, 2))",
+      )  # fmt: skip
+_also("simulation/curricula.py", "one random number is as good as another, one more is not used",
+      "numbers = jax.random.uniform(number_key, (3, batch))",
+      "grey_key = jax.random.fold_in(number_key, 2)",
+      "rest_key = jax.random.fold_in(number_key, 3)",
+      "equal = jax.random.uniform(jax.random.fold_in(key, 2), rate.shape) < EQUAL_AT_REST",
+      )  # fmt: skip
+_also("simulation/curricula.py", "random numbers are hardly ever just that",
+      "chosen = stopped & (noisy <= 0.5)", "drawn = noisy <= 0.25",
+      "equal = jax.random.uniform(jax.random.fold_in(key, 1), rate.shape) <= EQUAL_AT_REST",
+      "share = jnp.where(kind <= NEARLY_NOISELESS * slow, 0.02, 1.0)",
+      "stopped = scenes.pauses[:, 0, 1] - scenes.pauses[:, 0, 0] >= windows * seconds",
+      )  # fmt: skip
 _also("simulation/sensor.py", "how many at a time is speed alone",
       "EVENTS_PER_PASS = 5  # of a pixel, in one pass over the picture: saves memory traffic",
       *(f"span = min({bins}, BINS)  # bins that votes of one rendering reach" for bins in (
           "-(-(BINS - 1) // renderings) + 3", "-(-(BINS + 1) // renderings) + 2",
           "-(-(BINS - 1) - renderings) + 2")),
       )  # fmt: skip
-_also("simulation/sensor.py", "one random number is as good as another, and one more is not used",
+_also("simulation/sensor.py", "one random number is as good as another, one more is not used",
       "numbers = iter(jax.random.uniform(number_key, (7,)))",
       "off = on * (1 + settings.asymmetry * spread[1])",
       "own = settings.mismatch * jax.random.normal(mismatch_key, (3, *shape))",

@@ -18,7 +18,7 @@ from firenet_jax.simulation.curricula import (
     window_bounds,
 )
 from firenet_jax.simulation.scenes import SceneSettings
-from firenet_jax.simulation.sensor import FAULTY, Sensor, simulate
+from firenet_jax.simulation.sensor import FAULTY, Sensor, SensorSettings, simulate
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.training.settings import Train
 
@@ -75,6 +75,7 @@ def test_rare_sequences_are_slow_and_calm_or_swift_before_a_blank_ground(texture
     assert usual.max() < 2.51  # or less: a window lasts 300 ms at most
     grounds = np.asarray(scenes.textures[0]).reshape(96, -1)
     np.testing.assert_array_equal(np.ptp(grounds, axis=1) == 0, swift)
+    assert len(scenes.textures) == 2 and (np.ptp(scenes.textures[1], (1, 2)) > 0.05).all()
     assert 0.2 <= grounds[swift].min() < 0.3 and 0.7 < grounds[swift].max() <= 0.8
     calm = np.asarray(sensors.noise[:, 0]) < 0.5
     assert not calm[~slow].any() and 0.4 < calm[slow].mean() < 0.9
@@ -135,6 +136,21 @@ def test_paces_are_those_of_slow_usual_and_swift_sequences(slow, swift):
         else:  # no more than a pixel between two renderings
             expected = min(drawn, 1e6 * renderings / duration[k])
         assert speed[k] == pytest.approx(expected, rel=1e-4)
+
+
+def test_scenes_are_made_for_as_long_as_their_windows_last(textures, monkeypatch):
+    """All windows together, in seconds, and for the speed of their sequence."""
+
+    def random_scene(key, textures, *, duration, speed, settings, height, width):
+        return duration, speed
+
+    monkeypatch.setattr(curricula, "random_scene", random_scene)
+    settings = SETTINGS | {"batch": 20, "sensor": SensorSettings()}
+    make = random_setups.__wrapped__
+    _, (seconds, speeds), durations = make(jax.random.key(1), textures, **settings)
+    np.testing.assert_allclose(seconds, 1e-6 * T * np.asarray(durations), rtol=1e-5)
+    pixels = 1e-6 * np.asarray(durations) * np.asarray(speeds)
+    assert np.ptp(durations) > 1000 and (1.99 < pixels).all() and (pixels < 2.51).all()
 
 
 def sensors_of(batch, **fields):

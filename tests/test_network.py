@@ -1,4 +1,6 @@
+import re
 from dataclasses import FrozenInstanceError
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -69,6 +71,19 @@ def test_where_no_window_exists_the_state_stays(dtype):
         np.testing.assert_array_equal(found[1], old[1])
         np.testing.assert_allclose(found[exists], new[exists], atol=1e-6)
     np.testing.assert_allclose(image[exists], expected[exists], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "choices, fused",
+    [({}, {"gru", "residual"}), ({"dtype": jnp.bfloat16}, set()),
+     ({"exists": np.ones(1, bool)}, {"residual"})],
+)  # fmt: skip
+def test_blocks_are_fused_in_float32_where_all_windows_exist(choices, fused):
+    """For speed alone; a state that may have to stay as it is needs the gates one by one."""
+    params, tensors = random_run(steps=1, batch=1, height=8, width=9)
+    call = partial(step, state=initial_state(1, 8, 9), event_tensor=tensors[0], **choices)
+    program = str(jax.make_jaxpr(call)(params))
+    assert set(re.findall(r"custom_vjp_call\[\s*name=_(gru|residual)\b", program)) == fused
 
 
 def test_an_untrained_network_sees_grey():
