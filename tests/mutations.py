@@ -161,6 +161,41 @@ _also("simulation/sensor.py", "one random number is as good as another, one more
       "clean_key, plain_key = jax.random.split(jax.random.fold_in(key, 3))",
       "numbers = jax.random.uniform(key, (7,))",
       )  # fmt: skip
+_also("simulation/sensor.py", "the other sign is as likely",
+      "on, off = mean - deviation * spread",
+      "off = on * (1 - settings.asymmetry * spread[0])",
+      "on, off = on - own[0], off + own[1]", "on, off = on + own[0], off - own[1]",
+      "on, off = THRESHOLD - SPREAD * spread",
+      "noise_on = jnp.where(drawn > 0, bits % 2 != 1, noise_on)",
+      "noise_on = sensor.phase * 1025 % 2 < 1",
+      )  # fmt: skip
+_also("simulation/sensor.py", "random numbers are hardly ever just that",
+      "rate = 10.0 * 50.0**rate * jnp.where(sign <= 0.5, on, -off)",
+      "drift = jnp.where(chance <= share, rate, drift)",
+      "clean = jax.random.uniform(clean_key) <= settings.clean",
+      "noise_on = sensor.phase * 1024 % 2 <= 1", "fires = number <= chance",
+      )  # fmt: skip
+_also("simulation/sensor.py", "a second is not too long",
+      "longest = max(self.refractory or 1, *(self.refractory_range or (0, 0)))",
+      "longest = max(self.refractory or 0, *(self.refractory_range or (1, 0)))",
+      "longest = max(self.refractory or 0, *(self.refractory_range or (0, 1)))",
+      )  # fmt: skip
+_also("simulation/sensor.py", "one is there exactly if the other is",
+      "if sensor.refractory is not None or state.silent is not None:",
+      "if sensor.noise is not None or noise_on is not None:",
+      )  # fmt: skip
+_also("simulation/sensor.py", "a thousandth of a microsecond is not seen",
+      "spacing = jnp.maximum(run.spacing, 2).astype(jnp.float32)",
+      "return Run(first, spacing, count, run.polarity), jnp.maximum(silent - ticks, 1)",
+      )  # fmt: skip
+_also("simulation/sensor.py", "it is never 0 there",
+      "drifted = jnp.where(sensor.drift >= 0, sensor.on, -sensor.off) * sensor.phase",
+      "on = run.polarity[y, x][row] >= 0",
+      )  # fmt: skip
+_also("simulation/sensor.py", "it is written before it is read", "state, previous = None, 1")
+_also("simulation/sensor.py", "after the last event nothing votes",
+      "_, voted = jax.lax.while_loop(lambda carry: carry[0] <= most, several, start)",
+      )  # fmt: skip
 _also("simulation/sensor.py", "without noise its slope says nothing",
       "noise_slope=unless(0.1, sensor.noise_slope),")  # fmt: skip
 _also("simulation/sensor.py", "a bandwidth beyond all that happens",
@@ -176,6 +211,9 @@ _also("simulation/sensor.py", "what does not fire has no time", "up = rise >= 0"
       f"size = jnp.where(size > 0, size, 1.6){_NO_RISE}",
       "place = jnp.where(fires, number / jnp.where(fires, chance, 1.6), 0.0)",
       "place = jnp.where(fires, number / jnp.where(fires, chance, 1.0), 0.1)",
+      "first = jnp.where(count >= 0, skipped, 0.0).astype(jnp.int32) * run.spacing + run.first",
+      "first = jnp.where(count > 0, skipped, 0.1).astype(jnp.int32) * run.spacing + run.first",
+      "spacing = jnp.where(count > 1, stride, 0.1).astype(jnp.int32) * run.spacing",
       )  # fmt: skip
 _also("simulation/sensor.py", "a tenth of a tick is cut off",
       "first = jnp.clip(jnp.round(first * scale), 0.1, ticks.astype(jnp.float32)).astype(jnp.int32)"

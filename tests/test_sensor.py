@@ -434,6 +434,7 @@ def test_hot_pixels_fire_at_ten_to_five_hundred_hertz_on_or_off():
     rates = np.where(drift > 0, drift / sensor.on, -drift / sensor.off)[hot]
     assert 10 <= rates.min() < 10.2 and 490 < rates.max() <= 500.01
     assert abs(np.log(rates).mean() - np.log(10 * 500) / 2) < 0.1
+    assert module.first_state(sensor, jnp.ones((100, 100))).noise_on is None  # costs nothing
 
 
 def test_drifting_pixels_begin_anywhere_and_half_of_all_with_a_noise_event_on():
