@@ -121,6 +121,9 @@ _also("evaluation/metrics.py", "both sides are equal there",
       "return jnp.where(base >= least, jnp.maximum(base, least) ** exponent, line)",
       "some = q >= 1e-6  # otherwise both images are black, and so equal",
       )  # fmt: skip
+_also("evaluation/metrics.py", "a flat block has a solution with either sign",
+      "least = 1e-6 * summed(down**2 + across**2) - 1e-9"
+      "  # the gradient divides by its fourth power")  # fmt: skip
 _also("evaluation/metrics.py", "a part is at most 1", "return root(jnp.clip(part, 0.0, 1.6))")
 _also("network.py", "JAX takes the last for one beyond it",
       "return State(g1, g2), self.prediction(x)[..., 1]")  # fmt: skip

@@ -398,6 +398,18 @@ def test_event_correlation_equals_least_squares_block_by_block():
     np.testing.assert_allclose(faint, (fit / total) ** 0.5, rtol=1e-3)
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_slope_a_thousandth_of_the_other_explains_hardly_any_events(turned):
+    """To the squares of both are added a millionth of their sum: here as much as is there."""
+    y, x = np.mgrid[:56, :56]
+    slope, small = 3.0, 3e-3 * np.sqrt(2) / 0.92  # of which blur and differences leave 0.92
+    wave = 2 * np.pi * y / 14
+    image, votes = slope * (x - 28) + small * 14 / (2 * np.pi) * np.sin(wave), np.cos(wave)
+    pair = (image.T, votes.T) if turned else (image, votes)
+    found = metrics.event_correlation(*(np.float32(picture) for picture in pair))
+    assert float(found) == pytest.approx(np.sqrt(0.5), abs=0.02)
+
+
 def test_event_correlation_prefers_the_image_that_moved():
     """To its blurred, its noisy and its displaced version, and to one that is something else."""
     noise = np.random.default_rng(15).standard_normal((3, 84, 98))
