@@ -89,10 +89,10 @@ def test_wrong_shapes_are_named():
         reconstruct(weights, initial_state(1, 8, 9), jnp.zeros((2, 1, 8, 8, 5)))
 
 
-@pytest.mark.parametrize("kind, exact", [
-    ("float32", True), ("float16", True), ("bfloat16", True), ("bool", True), ("int8", True),
-    ("uint16", True), ("int32", False), ("uint32", False), ("float64", False), ("int64", False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "kind, exact",
+    [("float16", True), ("bool", True), ("uint16", True), ("int32", False), ("float64", False)],
+)
 def test_numbers_are_taken_if_float32_holds_them_exactly(kind, exact):
     weights, state = Weights(initial_params(jax.random.key(0)), True), initial_state(1, 8, 9)
     with jax.enable_x64(kind.endswith("64")):
