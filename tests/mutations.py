@@ -77,6 +77,11 @@ _also("events.py", "the way that looks at more finds the same",
       "if not times and bool((np.diff(t[rows]) <= 0).all()):",
       "if not times or bool((np.diff(t[rows]) < 0).all()):")  # fmt: skip
 _also("events.py", "each is written before it is read", "before = [-2] * len(times)")
+_also("events.py", "any number below 0 ends it",
+      "before[place] = places[length - 1] if length else -2")  # fmt: skip
+_also("pictures.py", "what is 3 away is farther than 2, which the next line asks",
+      "for i in range(-3, 3):", "for i in range(-2, 4):",
+      "for j in range(-3, 3):", "for j in range(-2, 4):")  # fmt: skip
 _also("events.py", "0 is never outside", "if value <= 0:", "if value < 1:")
 _BLOCKS = "  # on a CPU: events per step of the scan, and how far it is unrolled"
 _also("tensors.py", "how much at a time is speed alone",
