@@ -235,6 +235,18 @@ def test_one_event_is_one_window(choice):
     assert times_of(recording_of([5]), **choice) == [[5]]
 
 
+@pytest.mark.parametrize("choice", [{"events": 4}, {"events": 4, "longest": 9}])
+def test_a_window_that_is_full_does_not_wait_for_what_follows(choice):
+    """As a camera's events come it is shown at once."""
+
+    def chunks():
+        yield Events.of(range(4), *np.zeros((3, 4), int))
+        raise AssertionError("asked for more")
+
+    found = cut(replace(recording_of([]), events=chunks), Windows(**choice))
+    assert next(found).events.t.tolist() == [0, 1, 2, 3]
+
+
 def test_no_events_no_windows():
     for windows in (Windows(), Windows(duration=1)):
         assert list(cut(recording_of([]), windows)) == []
