@@ -88,6 +88,9 @@ _also("tensors.py", "how much at a time is speed alone",
       f"BLOCK, BLOCKS = 2**18, 8{_BLOCKS}", f"BLOCK, BLOCKS = 2**17, 9{_BLOCKS}",
       "times_copied = _helper(os.getpid()).submit(copy_times) if size > BLOCK else copy_times()"
       )  # fmt: skip
+_also("tensors.py", "of five bins, three have even numbers",
+      "even, odd = (BINS + 2) // 2, BINS // 2  # how many bins have even numbers and odd ones",
+      )  # fmt: skip
 _also("tensors.py", "the smallest size is larger", "size = 1",
       "def capacity(events: int, at_least: int = 1) -> int:")  # fmt: skip
 _also("tensors.py", "where it is not usable, nothing is",

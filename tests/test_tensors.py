@@ -276,19 +276,21 @@ def test_a_long_list_is_not_given_away_before_its_times_are_there(monkeypatch):
     np.testing.assert_array_equal(found, events.t.astype(np.int32))
 
 
-def test_lists_for_devices_hold_their_recordings():
-    """Four recordings on two devices; t_min and duration stay (T, B)."""
-    rng, size = np.random.default_rng(10), CAPACITIES[1]
-    rows = [[random_events(rng, n) for n in counts] for counts in [(5, 70, 3, 40), (1, 20, 30, 2)]]
-    both = pack_for_devices(rows, 2, at_least=size)
-    assert len(both.t) == 2 * size and both.t_min.shape == both.duration.shape == (2, 4)
-    for k in (0, 1):
-        alone = pack([row[2 * k :][:2] for row in rows], size)
-        used = alone.window < 4
-        for ours, theirs in zip(both[:5], alone[:5], strict=True):
+@pytest.mark.parametrize("devices", [1, 2, 3, 6])
+def test_lists_for_devices_hold_their_recordings(devices):
+    """Six recordings on some devices; t_min and duration stay (T, B)."""
+    rng, size, share = np.random.default_rng(10), CAPACITIES[1], 6 // devices
+    counts = (5, 70, 3, 40, 8, 0), (1, 20, 30, 2, 60, 9)
+    rows = [[random_events(rng, n) for n in each] for each in counts]
+    all_ = pack_for_devices(rows, devices, at_least=size)
+    assert len(all_.t) == devices * size and all_.t_min.shape == all_.duration.shape == (2, 6)
+    for k in range(devices):
+        alone = pack([row[share * k :][:share] for row in rows], size)
+        used = alone.window < 2 * share
+        for ours, theirs in zip(all_[:5], alone[:5], strict=True):
             np.testing.assert_array_equal(ours[k * size :][:size][used], theirs[used])
-        for ours, theirs in zip(both[5:], alone[5:], strict=True):
-            np.testing.assert_array_equal(ours[:, 2 * k :][:, :2], theirs)
+        for ours, theirs in zip(all_[5:], alone[5:], strict=True):
+            np.testing.assert_array_equal(ours[:, share * k :][:, :share], theirs)
 
 
 def recording_of(windows, size=7):
