@@ -193,7 +193,7 @@ def _unfinished(folder: Path, found: dict[str, Path]) -> None:
 
 
 def _newer(made, t: list, x: list, y: list, p: list) -> None:
-    """AEDAT of three versions with frames and triggers; ROS 2 in MCAP, whole and torn; EVT2."""
+    """AEDAT of three versions with frames, triggers; ROS 2 in MCAP, whole and torn; EVT2, 2.1."""
     import formats as f
     import pyarrow
 
@@ -240,6 +240,9 @@ def _newer(made, t: list, x: list, y: list, p: list) -> None:
     _sqlite(made("bag_sqlite/a.db3", b""), [message for chunk in chunks for message in chunk])
     words = [0x80000001, 0x10000803, 0xA0000101, 0x00001004] * 20
     made("two.raw", b"% evt 2.0\n% geometry 1280x720\n% end\n" + np.array(words, "<u4").tobytes())
+    words = [0x80000001, 0, 0x10000803, 0xF00F, 0xA0000101, 0, 0x00001004, 1] * 10
+    evt21 = b"% format EVT21;endianness=legacy;height=720;width=1280\n% end\n"
+    made("evt21.raw", evt21 + np.array(words, "<u4").tobytes())
 
 
 def _sqlite(path: Path, messages: list) -> None:
