@@ -69,7 +69,7 @@ class Loss:
         check_sizes(self, *DISTANCES, "detail", "lambda_tc", "l0", "L", zero=True)
 
 
-MAX_STILL_MOTION = 0.3  # pixels: `detail` counts for images after at most this much motion
+MAX_STILL_MOTION = 0.3  # pixels: `detail` counts for images after less motion than this
 DISTANCES = {
     "l1": metrics.l1,
     "centred": metrics.centred,
