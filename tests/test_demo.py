@@ -54,6 +54,7 @@ def test_a_link_stays_and_what_it_points_to_is_written(tmp_path, weights):
     assert link.is_symlink() and len(list(target.glob("frame_*.png"))) == 15
 
 
+@pytest.mark.slow
 def test_brightness_does_not_jump_where_the_next_windows_are_simulated(
     tmp_path, weights, monkeypatch
 ):

@@ -256,6 +256,7 @@ def test_what_no_event_tells_of_teaches_brightness_alone(tmp_path):
     assert np.abs(gradient(close) - first).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_what_is_near_events_stays_so_through_a_chain(tmp_path):
     """Two steps of a sequence, events in the first one's corner alone: there the frames of the
     second count as they are, and those of a new sequence after it do not."""
