@@ -29,8 +29,13 @@ COMMANDS = {
 }
 
 # Libraries that only some commands need -> the extra of this package that installs them.
-EXTRAS: dict[str, str] = dict.fromkeys(("optax", "orbax", "grain", "tensorboardX"), "train")
-EXTRAS |= {"skimage": "evaluate"}
+EXTRAS = {
+    "optax": "train",
+    "orbax": "train",
+    "grain": "train",
+    "tensorboardX": "train",
+    "skimage": "evaluate",
+}
 
 # Options of the original program (rpg_e2vid) -> the equivalent here.
 FORMER = {

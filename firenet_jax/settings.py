@@ -45,6 +45,13 @@ def check_sizes(settings: Any, *names: str, zero: bool = False) -> None:
             raise SettingsError(f"{name} is {value}, but must be {least}")
 
 
+def check_none_idle(names: list[str], where: str) -> None:
+    """Raises SettingsError, naming them, if there are options that have no effect there."""
+    if names:
+        said = ", ".join(names).replace("_", "-")
+        raise SettingsError(f"{said}: no part in {where}: leave it out")
+
+
 def check_range(name: str, bounds: tuple[float, float]) -> None:
     """Raises SettingsError unless a number can be drawn log-uniformly between these bounds."""
     least, greatest = bounds

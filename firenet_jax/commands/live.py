@@ -20,7 +20,7 @@ from firenet_jax.live.engine import Figures, Limits, cooled, pictures
 from firenet_jax.live.page import Board, serve
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
-from firenet_jax.settings import check_sizes, parse_size
+from firenet_jax.settings import check_none_idle, check_sizes, parse_size
 from firenet_jax.storage.screen import Screen
 from firenet_jax.windows import DEFAULT_LONGEST, Windows
 
@@ -83,11 +83,9 @@ class Live:
         camera = not self.replay and self.source == "camera"
         idle = ["wire"] if self.replay else ["speed", "repeat"]
         idle += ["wire", "sensor_size"] if camera else []
+        where = "replay" if self.replay else "camera" if camera else "stream (without --replay)"
         idle = [name for name in idle if getattr(self, name) != getattr(Live, name)]
-        if idle:
-            what = "replay" if self.replay else "camera" if camera else "stream (without --replay)"
-            said = ", ".join(idle).replace("_", "-")
-            raise SettingsError(f"{said}: no part in a {what}: leave it out")
+        check_none_idle(idle, f"a {where}")
 
 
 def source_of(settings: Live) -> sources.Source:

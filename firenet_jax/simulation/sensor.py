@@ -110,11 +110,12 @@ class SensorSettings:
 
     def __post_init__(self):
         """Raises SettingsError for invalid values."""
-        ranges = "threshold_range", "refractory_range", "noise_in_light"  # 0 0 turns none off
-        for name in (*ranges[:2], "noise", "leak", "hot", "cutoff", ranges[2], "flicker"):
-            bounds = getattr(self, name)
-            if _on(bounds) or bounds is not None and name in ranges:
-                check_range(name, bounds)
+        for name in ("threshold_range", "refractory_range", "noise_in_light"):
+            if getattr(self, name) is not None:
+                check_range(name, getattr(self, name))
+        for name in ("noise", "leak", "hot", "cutoff", "flicker"):
+            if _on(getattr(self, name)):
+                check_range(name, getattr(self, name))
         if _on(self.flicker) and self.flicker[1] > 1:
             raise SettingsError(f"flicker is {self.flicker}, but light is not negative: at most 1")
         check_share("clean", self.clean, "sequences")

@@ -13,7 +13,7 @@ import tyro
 
 from firenet_jax.devices import check_processes
 from firenet_jax.errors import SettingsError
-from firenet_jax.settings import check_range, check_seed, check_share, check_sizes
+from firenet_jax.settings import check_none_idle, check_range, check_seed, check_share, check_sizes
 from firenet_jax.simulation.curricula import LONGEST_WINDOW, check_motion, check_rare
 from firenet_jax.simulation.scenes import SceneSettings
 from firenet_jax.simulation.sensor import FAULTY, SensorSettings
@@ -183,10 +183,8 @@ def _check_idle(settings: Train) -> None:
             names += [n for n in inner if getattr(now, n) != getattr(default, n)]
         elif now != default:
             names.append(name)
-    if names:
-        kind = "sequences from --data" if settings.data else "simulated sequences"
-        said = ", ".join(names).replace("_", "-")
-        raise SettingsError(f"{said}: no part in training on {kind}: leave it out")
+    kind = "sequences from --data" if settings.data else "simulated sequences"
+    check_none_idle(names, f"training on {kind}")
 
 
 def _check_step(settings: Train) -> None:
