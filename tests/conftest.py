@@ -110,7 +110,10 @@ def recordings() -> Path:
     return _folder("FIRENET_RECORDINGS")
 
 
-@pytest.fixture(scope="module", params=["machine code", "XLA"])
+XLA = pytest.param("XLA", marks=pytest.mark.slow)
+
+
+@pytest.fixture(scope="module", params=["machine code", XLA])
 def each_way(request):
     """All tests of a module as they are on this processor, and then all by XLA alone.
 

@@ -123,6 +123,7 @@ def test_what_cannot_be_printed_is_one_sentence(line):
     assert run(closed).returncode == 0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only glibc has this setting")
 @pytest.mark.parametrize("chosen", [None, "glibc.malloc.check=0"])
 def test_the_program_runs_in_huge_pages_unless_told_otherwise(here, chosen):

@@ -233,10 +233,10 @@ def test_nothing_is_read_or_written_beside_the_arrays(shape):
     "maps, activations",
     [
         ([16], ["relu"]),
-        ([16, 16], ["sigmoid", "sigmoid"]),
-        ([16, 16], ["tanh"]),
         ([5], ["relu"]),
-        ([16, 16, 16], ["none", "tanh", "sigmoid"]),
+        pytest.param([16, 16], ["sigmoid", "sigmoid"], marks=pytest.mark.slow),
+        pytest.param([16, 16], ["tanh"], marks=pytest.mark.slow),
+        pytest.param([16, 16, 16], ["none", "tanh", "sigmoid"], marks=pytest.mark.slow),
     ],
 )
 def test_several_maps_as_one_with_bias_and_activation(maps, activations):

@@ -40,6 +40,7 @@ def textures():
     return load_textures(None, 8, 64, seed=2)
 
 
+@pytest.mark.slow
 def test_random_sequences_have_the_declared_shapes_and_do_not_retrace(textures):
     compiled = []
     for seed in range(2):

@@ -23,6 +23,7 @@ def weights(tmp_path):
 SMALL = {"seconds": 0.5, "sensor_size": "48x32"}
 
 
+@pytest.mark.slow
 def test_writes_events_reconstruction_and_truth_side_by_side(tmp_path, weights, capsys):
     out = tmp_path / "demo.mp4"
     result = run(Demo(out, weights, **SMALL))

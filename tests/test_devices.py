@@ -89,6 +89,7 @@ assert str(jax.process_index()) == os.environ["RANK"]
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["srun", "mpirun"])
 def test_processes_of_a_launcher_find_each_other(launcher):
     """JAX takes the port from the number of the job."""

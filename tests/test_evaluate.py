@@ -93,7 +93,7 @@ def settings(folder, output, **changes):
     return Evaluate(output=output, **(standard | changes))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=[pytest.param("all methods", marks=pytest.mark.slow)])
 def evaluated(folder):
     """(output folder, results) of all methods on both sequences."""
     return folder / "out", run(settings(folder, folder / "out"))

@@ -323,7 +323,10 @@ def test_steps_that_are_all_kept_are_those_of_reconstruct(weights):
         np.testing.assert_allclose(after.last.g2, state.g2, atol=1e-6)
 
 
-@pytest.mark.parametrize("recurrent, pad, wanted", [(True, 2, True), (False, 1, False)])
+LOOKS = (True, 2, True), pytest.param(False, 1, False, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("recurrent, pad, wanted", LOOKS)
 def test_pictures_of_looks_are_those_of_their_images(recurrent, pad, wanted):
     """Tensors are normalised, then padded; the display forgets the images of what is kept."""
     rng = np.random.default_rng(5)

@@ -226,6 +226,7 @@ def test_near_events_are_those_within_four_pixels_in_this_window_or_before():
     np.testing.assert_array_equal(near_events(jnp.asarray(tensors)), expected)
 
 
+@pytest.mark.slow
 def test_what_no_event_tells_of_teaches_brightness_alone(tmp_path):
     """Other details of frames where nothing happens: the same gradients; where events are: others.
     And the image is held where nothing happens: a brighter frame has another gradient."""

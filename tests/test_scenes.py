@@ -332,6 +332,7 @@ def test_before_a_still_camera_only_objects_move():
     assert 0 < stood < MANY
 
 
+@pytest.mark.slow
 def test_a_shaking_camera_comes_back_again_and_again():
     """By less than it is allowed to, and no faster than said; one without a shake goes away."""
     settings = SceneSettings(objects=2, speed=SPEEDS, pause=0.0, still=1.0)

@@ -19,6 +19,7 @@ from firenet_jax.tensors import pack, voxelise
 T, SIZE, RENDERINGS = 12, 96, 5
 
 
+@pytest.mark.slow
 def test_a_warm_up_makes_first_images_nearly_as_good_as_later_ones():
     """Built-in weights on two simulated recordings: the error of their first images."""
     square = {"height": SIZE, "width": SIZE}

@@ -270,6 +270,7 @@ def frozen_run(folder, frozen=("gru2", "head"), **choices):
     return settings, state, data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("optimiser", ["muon", "adam"])
 def test_frozen_blocks_keep_the_weights_they_start_from(tmp_path, optimiser):
     settings, state, data = frozen_run(tmp_path, optimiser=optimiser)

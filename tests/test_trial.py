@@ -98,6 +98,7 @@ def random_layer(rng, height, width, batch, inputs=16):
 SEEDS = [*range(2), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 40))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_random_sizes_batches_and_masks(seed):
     rng = np.random.default_rng(seed)
@@ -150,6 +151,7 @@ def random_cases():
     return cases[0], jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases)
 
 
+@pytest.mark.slow
 def test_mapped():
     _, stacked = random_cases()
     both_ways(lambda ours: jax.vmap(steps(ours)))(*stacked)
@@ -220,6 +222,7 @@ def run_alone(script, **environment):
     subprocess.run([sys.executable, "-c", EQUAL + script], env=environment, check=True)
 
 
+@pytest.mark.slow
 def test_on_four_devices():
     run_alone(ON_DEVICES, XLA_FLAGS=f"{OLD_EMITTERS} --xla_force_host_platform_device_count=4")
 
