@@ -624,7 +624,7 @@ def test_all_that_pictures_depend_on_is_what_a_run_goes_on_with(tmp_path, weight
         {"normalise": False},
     ):  # fmt: skip
         assert record(**choice) != record(), choice
-    for choice in ({"chunk": 2}, {"batch": 3}, {"fps": 5.0}, {"overwrite": True}):
+    for choice in ({"chunk": 2}, {"batch": 3}, {"overwrite": True}):
         assert record(**choice) == record(), choice
     assert record("a.mp4", fps=5.0) != record("a.mp4")
 
@@ -721,5 +721,15 @@ def test_real_time_is_the_default_and_each_event_is_counted_once(tmp_path, weigh
         assert said in line and "of 3,000 events" in line and "Mev/s" not in line
     with pytest.raises(ValueError, match="fps and speed"):
         settings(weights, (recording,), tmp_path / "a.mp4", fps=5.0, speed=1.0)
+    for name, choice, said in (
+        ("out", {"speed": 0.5}, "speed: no part in a folder of pictures"),
+        ("a.h5", {"fps": 5.0, "topic": "/a"}, "fps, topic: no part in a .h5"),
+        ("a.bag", {"speed": 1.0}, "speed: no part in a .bag"),
+        ("a.mp4", {"frame_id": "a"}, "frame-id: no part in a .mp4"),
+    ):
+        with pytest.raises(SettingsError, match=said):
+            settings(weights, (recording,), tmp_path / name, **choice)
+    with pytest.raises(OutputError, match="cannot write .avi files"):
+        run(settings(weights, (recording,), tmp_path / "a.avi", fps=25.0))
     run(settings(weights, (recording,), tmp_path / "one", windows=Windows(events=3000)))
     assert "1 picture of 3,000 events" in capsys.readouterr().out

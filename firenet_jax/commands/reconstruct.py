@@ -27,7 +27,7 @@ from firenet_jax.network import Weights
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import Network
-from firenet_jax.settings import check_sizes, parse_size
+from firenet_jax.settings import check_none_idle, check_sizes, parse_size
 from firenet_jax.storage import video
 from firenet_jax.storage.arrays import ArraysWriter
 from firenet_jax.storage.bag import BagWriter, check_topic
@@ -156,6 +156,19 @@ class Reconstruct:
                 ".h5 holds images as the network gives them: leave out --preview, --color, "
                 "--unsharp, --range and --bilateral"
             )
+        _check_idle(self)
+
+
+def _check_idle(settings: Reconstruct) -> None:
+    """Raises SettingsError for what would have no effect on this kind of output."""
+    suffix = settings.output.suffix
+    if suffix not in video.WHOLE and video.like_a_file(suffix):
+        return  # nothing can be written there, which is said later
+    idle = [] if suffix in video.VIDEOS else ["fps", "speed"]
+    idle += [] if suffix in (".bag", ".ros2") else ["topic", "frame_id"]
+    idle = [name for name in idle if getattr(settings, name) != getattr(Reconstruct, name)]
+    kind = f"a {suffix}" if suffix in video.WHOLE else "a folder of pictures"
+    check_none_idle(idle, kind)
 
 
 def run(settings: Reconstruct) -> list[Path]:
