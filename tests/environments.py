@@ -1,12 +1,14 @@
 """The core's tests, in one virtual environment for each of these versions of what it stands on.
 
     python tests/environments.py                       all
-    python tests/environments.py "without llvmlite"    one
+    python tests/environments.py lowest                one: all tests, with the lowest versions
     python3.14 tests/environments.py "newest jax"      with the newest that another Python can have
 
 An environment holds the package as pip installs it from here, and pytest; then what it is about is
-installed over that, whatever bounds the package has. What needs PyTorch is skipped. Where there is
-no newer Python, a folder of Debian's next release is one, as root:
+installed over that, whatever bounds the package has. "lowest" holds all extras too, and each
+library that pyproject.toml names in the lowest version that it allows; the newest that are allowed
+are those of `.ci/run`. What needs PyTorch is skipped. Where there is no newer Python, a folder of
+Debian's next release is one, as root:
 
     debootstrap --include=python3-venv,ca-certificates sid FOLDER && cp -r . FOLDER/opt/firenet
     chroot FOLDER python3 /opt/firenet/tests/environments.py "newest jax"
@@ -14,14 +16,18 @@ no newer Python, a folder of Debian's next release is one, as root:
 
 import argparse
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
+import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+LOWEST = "lowest"
 ENVIRONMENTS = {  # name: (what pip does besides, environment)
+    LOWEST: ([], {}),
     "without llvmlite": (["uninstall", "-y", "llvmlite"], {}),
     "switched off": ([], {"FIRENET_NATIVE": "0"}),
     "jax 0.10.0": (["install", "jax==0.10.0", "jaxlib==0.10.0"], {}),
@@ -33,6 +39,18 @@ CORE = """
     choice machine_code foreign_call native convolve3x3 trial
 """.split()
 TOOLS = ["pytest>=8.3"]
+# Of the lowest versions. They warn of each other; what is released is not there to be looked at.
+ALL = ["-n", "2", "-W", "default::DeprecationWarning", "--ignore", "tests/test_release.py"]
+
+
+def lowest() -> list[str]:
+    """All libraries that the package needs, extras included, in the lowest versions it allows."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    needed = [*project["dependencies"]]
+    needed += [each for name in ("train", "evaluate", "formats", "export") for each in extras[name]]
+    bounds = [re.match(r"([\w-]+)>=([\d.]+)", each) for each in needed]
+    return sorted({f"{bound[1]}=={bound[2]}" for bound in bounds if bound})
 
 
 def tried(name: str, folder: Path) -> bool:
@@ -46,7 +64,10 @@ def tried(name: str, folder: Path) -> bool:
     # A copy: what pip builds in a checkout stays there, and the installed package is what is tried.
     copy = folder / "source"
     shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", ".venv", "results"))
-    run_pip("install", copy, *TOOLS)
+    if name == LOWEST:
+        run_pip("install", f"{copy}[all]", *TOOLS, "pytest-xdist>=3.6", *lowest())
+    else:
+        run_pip("install", copy, *TOOLS)
     if pip:
         run_pip(*pip)
     shutil.rmtree(copy / "firenet_jax")
@@ -57,7 +78,7 @@ def tried(name: str, folder: Path) -> bool:
         "('jax', 'jaxlib', 'flax', 'llvmlite', 'numpy')), sep=', ', flush=True)"
     )
     subprocess.run([python, "-c", about], check=True)
-    tests = [f"tests/test_{each}.py" for each in CORE]
+    tests = ALL if name == LOWEST else [f"tests/test_{each}.py" for each in CORE]
     command = [python, "-m", "pytest", "-p", "no:cacheprovider", *tests]
     outside = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     return subprocess.run(command, cwd=copy, env=outside | environment).returncode == 0
