@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from firenet_jax.errors import SettingsError
 from firenet_jax.events import Events, concatenate
 from firenet_jax.network import initial_state
 from firenet_jax.reconstruction import reconstruct
@@ -22,6 +23,7 @@ from firenet_jax.simulation.sensor import (
     TICKS,
     Sensor,
     SensorSettings,
+    check_idle,
     event_list,
     random_sensor,
     simulate,
@@ -358,6 +360,21 @@ def test_sensors_at_the_edge_of_what_can_be(choice):
 def test_sensors_beyond_the_edge(choice, message):
     with pytest.raises(ValueError, match=message):
         SensorSettings(**choice)
+
+
+@pytest.mark.parametrize(
+    "more, fault",
+    [({"asymmetry": 0.3}, {"threshold_range": (0.1, 0.6)}),
+     ({"noise_in_light": (0.1, 0.1)}, {"noise": (1.0, 2.0)}),
+     ({"cutoff_dark": 0.2}, {"cutoff": (100.0, 200.0)})],
+)  # fmt: skip
+def test_more_of_a_fault_that_is_off_is_refused(more, fault):
+    said, option = (next(iter(each)).replace("_", "-") for each in (more, fault))
+    for settings in (SensorSettings(**more, **fault), SensorSettings(**fault), FAULTY):
+        check_idle(settings)
+    check_idle(SensorSettings())
+    with pytest.raises(SettingsError, match=f"--{said} says more of --{option}, which is not"):
+        check_idle(SensorSettings(**more))
 
 
 def test_the_sensor_if_nothing_is_said():

@@ -23,8 +23,10 @@ from firenet_jax.tensors import (
     normalise,
     pack,
     pack_for_devices,
+    tensor_chunks,
     voxelise,
 )
+from firenet_jax.windows import Windows, cut
 
 
 def random_events(rng, count, height=12, width=17, start=10**15, span=50_000):
@@ -319,6 +321,14 @@ def test_a_recording_becomes_chunks_of_tensors_with_the_times_of_their_ends(chun
     for tensor, end, count in zip(tensors, ends, counts, strict=True):
         window = events.select(slice(end - count, end))
         np.testing.assert_allclose(tensor, references.event_tensor(window, 12, 17), atol=1e-5)
+
+
+def test_a_shorter_last_chunk_is_filled_up_to_the_length_of_the_others():
+    recording, _ = recording_of([30, 20, 0, 10, 25])
+    chunks = list(tensor_chunks(recording, cut(recording, Windows(duration=1)), 2))
+    assert [len(group) for group, _ in chunks] == [2, 2, 1]
+    assert {tensors.shape for _, tensors in chunks} == {(2, 1, 12, 17, 5)}
+    assert not np.asarray(chunks[-1][1][1]).any()
 
 
 def test_a_chunk_holds_a_window_at_least():
