@@ -164,11 +164,13 @@ def test_reconstruct_writes_each_kind_of_output(here, capsys, output):
 def test_every_option_is_accepted(here, capsys):
     (here / "hot.txt").write_text("1,1\n")
     line = f"{RUN} -T 50 --step 25 --no-recurrent --bfloat16 --pad 16 --range extremes --unsharp 0 "
-    line += "--hot-pixels hot.txt --flip --start 0.1 --stop 0.9 --fps 10 --sensor-size 30x40 "
+    line += "--hot-pixels hot.txt --flip --start 0.1 --stop 0.9 --sensor-size 30x40 "
     line += "--chunk 3 --batch 2 --overwrite"
     code, _, error = firenet(capsys, line)
     assert code == 0, error
     assert len(list((here / "out").glob("*.png"))) == 31  # starts 0, 25, ... 750 ms
+    code, _, error = firenet(capsys, f"{RUN} --fps 10 -o out.mp4")
+    assert code == 0 and (here / "out.mp4").exists(), error
 
 
 def test_info_as_lines_and_as_json(here, capsys):

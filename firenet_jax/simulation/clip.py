@@ -43,7 +43,7 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
                         "convert the clip to a constant rate"
                     )
                 last = time
-                turns = getattr(frame, "rotation", 0) // 90 % 4  # of a telephone held upright
+                turns = frame.rotation // 90 % 4  # of a telephone held upright
                 stored = size[::-1] if size and turns % 2 else size  # before it is turned
                 height, width = stored or (frame.height, frame.width)
                 # By way of RGB: the grey plane of a video does not reach from 0 to 255.
