@@ -26,6 +26,7 @@ SMALL = {
     "colour_mosaic": "--windows 4",
     "compare_losses": "{folder}/runs --steps 1 --only l1",
     "compare_optimisers": "{folder}/runs --steps 1 --only 'muon, rate 3e-3'",
+    "dormant": str(WEIGHTS),
     "endurance": f"{WEIGHTS} --recordings {{folder}} --only palindrome contrast",
     "exactness": "--cases 1",
     "figure3_qualitative": "--seconds 0.2",
@@ -70,6 +71,7 @@ SMALLER = {
         "crop=64,": "crop=32,",
         "windows=16,": "windows=11,",
     },
+    "dormant": {"batch=4, windows=30": "batch=1, windows=10"},
     "endurance": {"ROUNDS = 40": "ROUNDS = 2"},
     "figure4_high_speed": {
         '"height": 480, "width": 640': '"height": 120, "width": 160',
