@@ -736,8 +736,10 @@ OPEN = replace(
 # passes in it, more than ever here; and eleven of the last residual block's 16 channels had died,
 # up to here unseen: an update whose mean is not zero shifts what always is active, and with it all
 # that follows. They are drawn anew (`woken`), at a rate that keeps them alive.
+# Dense windows and contrast are better than in what is built in; but memory is worse in recordings
+# to and fro, and so are cameras' frames. In no mean yet; its last weights are in results/stages/.
 # (480 steps with longer chains, rest in three tenths and windows to and fro in 15 % rested better,
-# and were worse in pictures, and in real recordings to and fro.)
+# and pictures were worse.)
 RAPID = replace(
     KEEN,
     textures=3072,
