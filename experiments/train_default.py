@@ -737,7 +737,8 @@ OPEN = replace(
 # up to here unseen: an update whose mean is not zero shifts what always is active, and with it all
 # that follows. They are drawn anew (`woken`), at a rate that keeps them alive.
 # Dense windows and contrast are better than in what is built in; but memory is worse in recordings
-# to and fro, and so are cameras' frames. In no mean yet; its last weights are in results/stages/.
+# to and fro, and so are cameras' frames. In no mean yet; its last weights are in results/stages/,
+# and what it began from ("woken"): half of each has most of the gain in pictures, and remembers.
 # (480 steps with longer chains, rest in three tenths and windows to and fro in 15 % rested better,
 # and pictures were worse.)
 RAPID = replace(
