@@ -3,10 +3,10 @@
     python experiments/dormant.py WEIGHTS...                                            1 minute
 
 WEIGHTS: "built-in", and files of others, a name may be given: ours=PATH. A channel that never
-exceeds zero behind a ReLU costs its time and gives nothing; it has no gradient either, so no
-training wakes it. Here: the share of pixels in which each channel is active, over the last ten of
-thirty windows of eight simulated sequences, half of them of sensors with faults; dormant is what is
-active in less than a thousandth. Prints a table and writes results/dormant.json.
+exceeds zero behind a ReLU costs its time and gives nothing; its own kernel has no gradient either,
+so that training hardly wakes it. Here: the share of pixels in which each channel is active, over
+the last ten of thirty windows of eight simulated sequences, half of them of sensors with faults;
+dormant is what is active in less than a thousandth. Prints a table and writes results/dormant.json.
 """
 
 import argparse

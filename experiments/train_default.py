@@ -15,7 +15,7 @@ sensors does; then detail where next to nothing moves; then sequences of hundred
 windows; then windows of any density, and noise alone; then specialists, of which a mean is made;
 then noise as it is in the dark; everything at once in large batches on a GPU; and at last, with the
 memory of what that began from, what makes pictures of the state. Each was a lesson of the one
-before.
+before. Stages after "limpid" go on from what is built in and have no part in it yet.
 
 PICTURES were 63: scikit-image's own (`textures.PHOTOGRAPHS`), matplotlib's sample data, and those
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
@@ -55,8 +55,8 @@ the reference of L, so that it mostly alternated; since then it alternates. Up t
 for good had no noise of its own (`curricula.AT_REST`).
 
 The report is written to results/train_default.json, the curve to results/train_default.png. Stages
-that are not in RUN, because they ran elsewhere, keep what was reported of them; of "dusk" to "vast"
-nothing was, but the steps.
+that are not in RUN, because they ran elsewhere, keep what was reported of them; of "dusk" to
+"vast", of "grand" and "open" nothing was, but the steps.
 """
 
 import json
@@ -733,9 +733,9 @@ OPEN = replace(
 )
 # From both and half as much of what was built in, with all of the old memory. Where smooth
 # pictures fill a window with an event per pixel, as much as a quarter of the picture's width
-# passes in it, more than ever here; and eleven of the last residual block's 16 channels had died,
-# up to here unseen: an update whose mean is not zero shifts what always is active, and with it all
-# that follows. They are drawn anew (`woken`), at a rate that keeps them alive.
+# passes in it, more than ever here; and eleven of the last residual block's 16 channels had died
+# (dormant.py), probably because three of its inputs are always active, so that each update shifts
+# all that follows. They are drawn anew (`woken`): at this rate they stay alive, at 1.5e-3 they die.
 # Dense windows and contrast are better than in what is built in; but memory is worse in recordings
 # to and fro, and so are cameras' frames. In no mean yet; its last weights are in results/stages/,
 # and what it began from ("woken"): half of each has most of the gain in pictures, and remembers.
