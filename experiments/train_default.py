@@ -67,6 +67,7 @@ import jax
 import matplotlib
 import numpy as np
 import tyro
+from centred import run_centred
 from dormant import RARE, active, last_block, second_maps
 from harness import RESULTS, save
 
@@ -736,11 +737,10 @@ OPEN = replace(
 # passes in it, more than ever here; and eleven of the last residual block's 16 channels had died
 # (dormant.py), probably because three of its inputs are always active, so that each update shifts
 # all that follows. They are drawn anew (`woken`): at this rate they stay alive, at 1.5e-3 they die.
-# Dense windows and contrast are better than in what is built in; but memory is worse in recordings
-# to and fro, and so are cameras' frames. In no mean yet; its last weights are in results/stages/,
-# and what it began from ("woken"): half of each has most of the gain in pictures, and remembers.
-# (480 steps with longer chains, rest in three tenths and windows to and fro in 15 % rested better,
-# and pictures were worse.)
+# Dense windows and contrast are better than in what it began from ("woken"); but memory is worse in
+# recordings to and fro, and so are cameras' frames. Half of each has most of the gain in pictures,
+# and remembers. (480 steps with longer chains, rest in three tenths and windows to and fro in 15 %
+# rested better, and pictures were worse.)
 RAPID = replace(
     KEEN,
     textures=3072,
@@ -754,6 +754,54 @@ RAPID = replace(
     loss=replace(VAST.loss, L=CLEAR.loss.L, lambda_tc=4.0),
     sensor=replace(VAST.sensor, clean=0.6),
 )
+# From half of "rapid" and half of "woken": the usual again, and as much motion. Cameras' frames and
+# sparse windows of faulty sensors are better than ever; a recording to and fro sinks to dark.
+AMPLE = replace(
+    RAPID,
+    textures=4096,
+    steps=700,
+    chain=12,
+    motion=(1.5, 40.0),
+    slow=0.12,
+    to_and_fro=0.1,
+    warmup=15,
+    seed=601,
+    loss=replace(VAST.loss, L=CLEAR.loss.L, l1=0.7, lambda_tc=6.0),
+    scene=replace(VAST.scene, halt=0.3),
+    sensor=VAST.sensor,
+)
+# From where "ample" began, clean sensors alone, with centred updates (centred.py), so that the rate
+# may be three times as high: more than 370 and 700 steps before had brought, in 892.
+BRISK = replace(
+    KEEN,
+    textures=4096,
+    steps=892,
+    crop=80,
+    chain=6,
+    renderings=30,
+    motion=(2.0, 30.0),
+    learning_rate=2e-3,
+    seed=711,
+    loss=replace(
+        KEEN.loss, contrast=3.0, haarpsi=0.5, equalised=4.0, equalised_mse=16.0, detail=0.0,
+        lambda_tc=2.0,
+    ),
+    scene=replace(KEEN.scene, plain=0.05, objects=3),
+    sensor=replace(KEEN.sensor, clean=1.0),
+)  # fmt: skip
+# From half of "ample" and half of "brisk", side by side, centred too: the usual, with fewer faults
+# and with more.
+BOLD = replace(
+    AMPLE,
+    steps=700,
+    crop=80,
+    renderings=32,
+    motion=(2.5, 32.0),
+    learning_rate=2e-3,
+    seed=721,
+    sensor=replace(AMPLE.sensor, clean=0.65),
+)
+HALE = replace(BOLD, motion=(1.5, 32.0), seed=722, sensor=replace(AMPLE.sensor, clean=0.3))
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
@@ -798,6 +846,17 @@ STAGES = {
     "grand": (GRAND, None),
     "open": (OPEN, None),
     "rapid": (RAPID, None),
+    "ample": (AMPLE, None),
+    "brisk": (BRISK, None),
+    "bold": (BOLD, None),
+    "hale": (HALE, None),
+}
+# Those with centred updates: minutes, of which the rate sinks in the last part, after so many steps
+# in which it rises.
+CENTRED = {
+    "brisk": {"minutes": 28.0, "rising": 100, "sinking": 0.35},
+    "bold": {"minutes": 26.0},
+    "hale": {"minutes": 26.0},
 }
 # Parts of a mean: what a stage starts from, if not from the one before.
 FIRST = {"even": 1, "usual": 1, "settle": 1, "natural": 9}
@@ -857,13 +916,22 @@ MEANS |= {
     "lucid": {"vast": 1},
     "limpid": {"vast": 1},
 }
-# What is built in; the stages after these go on from it.
-SHIPPED = {"lucid": 1, "limpid": 1}
-MEANS |= {"grand": SHIPPED, "open": SHIPPED, "rapid": {"grand": 4, "open": 2} | SHIPPED}
-# The candidate of the second ConvGRU is that of "vast", with this share of that of DUSKY, which
-# "vast" began from. More of it remembers better what goes to and fro, and rests less well; with .6
-# pictures are best.
-REMEMBERED = {"lucid": 1.0, "limpid": 0.6, "grand": 0.6, "open": 0.6, "rapid": 1.0, "shipped": 0.6}
+LUCIDS = {"lucid": 1, "limpid": 1}
+HALVES = {"rapid": 1, "woken": 1}
+MEANS |= {
+    "grand": LUCIDS,
+    "open": LUCIDS,
+    "rapid": {"grand": 4, "open": 2} | LUCIDS,
+    "ample": HALVES,
+    "brisk": HALVES,
+    "bold": {"ample": 1, "brisk": 1},
+    "hale": {"ample": 1, "brisk": 1},
+}
+SHIPPED = {"bold": 1, "hale": 1}
+# The candidate of the second ConvGRU has this share of that of DUSKY, which "vast" began from; the
+# rest is, up to "rapid", that of "vast", and of what is built in, its own. More of it remembers
+# better what goes to and fro, and rests less well.
+REMEMBERED = {"lucid": 1.0, "limpid": 0.6, "grand": 0.6, "open": 0.6, "rapid": 1.0, "shipped": 0.7}
 # For the last bias of what "ages" began from: on pictures of the pool, images were darker than
 # truth, by 0.05. What was made of it since is trained.
 LIFTS = {"ages": 0.03}
@@ -876,29 +944,34 @@ def train(folder: Path, images: Path) -> None:
             path = folder / f"before_{name}.npz"
             weights = average(folder, MEANS[name], path, LIFTS.get(name, 0.0))
         if name in REMEMBERED:
-            weights = remembering(folder, weights, REMEMBERED[name])
+            weights = remembering(folder, weights, folder / "vast" / "last.npz", REMEMBERED[name])
         if name == "rapid":
-            weights = woken(weights, replace(settings, images=images))
-        run(replace(settings, output=folder / name, images=images, weights=weights), stop)
+            path = folder / "woken" / "last.npz"
+            weights = woken(weights, replace(settings, images=images), path)
+        settings = replace(settings, output=folder / name, images=images, weights=weights)
+        if name in CENTRED:
+            run_centred(settings, **CENTRED[name])
+        else:
+            run(settings, stop)
         weights = folder / name / "last.npz"
-    remembering(folder, average(folder, SHIPPED, folder / "weights.npz"), REMEMBERED["shipped"])
+    weights = average(folder, SHIPPED, folder / "weights.npz")
+    remembering(folder, weights, weights, REMEMBERED["shipped"])
 
 
-def remembering(folder: Path, path: Path, share: float) -> Path:
-    """Gives the weights at `path` the memory of "vast", with this share of that of DUSKY."""
+def remembering(folder: Path, path: Path, other: Path, share: float) -> Path:
+    """Gives the weights at `path` the memory of those at `other`, with this share of DUSKY's."""
     weights = load_weights(path)
-    vast = load_weights(folder / "vast" / "last.npz").params["gru2"]
-    dusky = load_weights(average(folder, DUSKY, folder / "dusky.npz")).params["gru2"]
-    candidate = jax.tree.map(
-        lambda a, b: (1 - share) * a + share * b, vast["candidate"], dusky["candidate"]
-    )
+    own = load_weights(other).params["gru2"]["candidate"]
+    dusky = load_weights(average(folder, DUSKY, folder / "dusky.npz")).params["gru2"]["candidate"]
+    candidate = jax.tree.map(lambda a, b: (1 - share) * a + share * b, own, dusky)
     gru2 = weights.params["gru2"] | {"candidate": candidate}
     save_weights(path, replace(weights, params=weights.params | {"gru2": gru2}))
     return path
 
 
-def woken(path: Path, settings: Train) -> Path:
-    """Draws the dormant channels of the last residual block anew, as Sokar et al. (ICML 2023) do.
+def woken(path: Path, settings: Train, made: Path) -> Path:
+    """Draws the dormant channels of the last residual block anew, as Sokar et al. (ICML 2023) do:
+    of the weights at `path`, written to `made`.
 
     Dormant is what is active in less than a thousandth of the pixels of a batch of the stage to
     come. What comes in is drawn, so that it is active in half of them; what goes out is zero.
@@ -924,8 +997,9 @@ def woken(path: Path, settings: Train) -> Path:
     second["bias"][outside] = -np.median(last_block(params["res2"], g2)[1], (0, 1, 2))[outside]
     params["prediction"]["kernel"][:, :, outside] = 0
     print(f"woken: {inside.sum()} channels between and {outside.sum()} after the convolutions")
-    save_weights(path, replace(weights, params=params))
-    return path
+    made.parent.mkdir(parents=True, exist_ok=True)
+    save_weights(made, replace(weights, params=params))
+    return made
 
 
 def average(folder: Path, parts: dict[str, float], path: Path, lift: float = 0.0) -> Path:
