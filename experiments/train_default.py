@@ -13,9 +13,10 @@ passed; then the usual motion and faults again; then other pictures, most of the
 everyday things; rare motion, much slower and much faster, and noise that alternates as that of real
 sensors does; then detail where next to nothing moves; then sequences of hundreds of
 windows; then windows of any density, and noise alone; then specialists, of which a mean is made;
-then noise as it is in the dark; everything at once in large batches on a GPU; and at last, with the
-memory of what that began from, what makes pictures of the state. Each was a lesson of the one
-before. Stages after "limpid" go on from what is built in and have no part in it yet.
+then noise as it is in the dark; everything at once in large batches on a GPU; then, with the memory
+of what that began from, what makes pictures of the state; everything again on a GPU; more motion,
+with channels that had died drawn anew; and at last updates after which none dies (centred.py). Each
+was a lesson of the one before.
 
 PICTURES were 63: scikit-image's own (`textures.PHOTOGRAPHS`), matplotlib's sample data, and those
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
@@ -56,7 +57,8 @@ for good had no noise of its own (`curricula.AT_REST`).
 
 The report is written to results/train_default.json, the curve to results/train_default.png. Stages
 that are not in RUN, because they ran elsewhere, keep what was reported of them; of "dusk" to
-"vast", of "grand" and "open" nothing was, but the steps.
+"vast", of "grand" and "open" nothing was, but the steps, nor of "brisk" and "hale", which validate
+nothing.
 """
 
 import json
@@ -789,19 +791,19 @@ BRISK = replace(
     scene=replace(KEEN.scene, plain=0.05, objects=3),
     sensor=replace(KEEN.sensor, clean=1.0),
 )  # fmt: skip
-# From half of "ample" and half of "brisk", side by side, centred too: the usual, with fewer faults
-# and with more.
-BOLD = replace(
+# From half of "ample" and half of "brisk", centred too: the usual, mostly with faults. Alone worse
+# than both; with a little of it in a mean, recordings to and fro come back better. (With fewer
+# faults it gave nothing.)
+HALE = replace(
     AMPLE,
-    steps=700,
+    steps=750,
     crop=80,
     renderings=32,
-    motion=(2.5, 32.0),
+    motion=(1.5, 32.0),
     learning_rate=2e-3,
-    seed=721,
-    sensor=replace(AMPLE.sensor, clean=0.65),
+    seed=722,
+    sensor=replace(AMPLE.sensor, clean=0.3),
 )
-HALE = replace(BOLD, motion=(1.5, 32.0), seed=722, sensor=replace(AMPLE.sensor, clean=0.3))
 STAGES = {
     "clean": (CLEAN, STOP),
     "real": (REAL, None),
@@ -848,14 +850,12 @@ STAGES = {
     "rapid": (RAPID, None),
     "ample": (AMPLE, None),
     "brisk": (BRISK, None),
-    "bold": (BOLD, None),
     "hale": (HALE, None),
 }
 # Those with centred updates: minutes, of which the rate sinks in the last part, after so many steps
 # in which it rises.
 CENTRED = {
     "brisk": {"minutes": 28.0, "rising": 100, "sinking": 0.35},
-    "bold": {"minutes": 26.0},
     "hale": {"minutes": 26.0},
 }
 # Parts of a mean: what a stage starts from, if not from the one before.
@@ -924,14 +924,15 @@ MEANS |= {
     "rapid": {"grand": 4, "open": 2} | LUCIDS,
     "ample": HALVES,
     "brisk": HALVES,
-    "bold": {"ample": 1, "brisk": 1},
     "hale": {"ample": 1, "brisk": 1},
 }
-SHIPPED = {"bold": 1, "hale": 1}
+# With more of "brisk" windows of clean sensors are better, and rest is darker; with more of "ample"
+# windows with faults are.
+SHIPPED = {"ample": 3, "brisk": 2, "hale": 1}
 # The candidate of the second ConvGRU has this share of that of DUSKY, which "vast" began from; the
 # rest is, up to "rapid", that of "vast", and of what is built in, its own. More of it remembers
 # better what goes to and fro, and rests less well.
-REMEMBERED = {"lucid": 1.0, "limpid": 0.6, "grand": 0.6, "open": 0.6, "rapid": 1.0, "shipped": 0.7}
+REMEMBERED = {"lucid": 1.0, "limpid": 0.6, "grand": 0.6, "open": 0.6, "rapid": 1.0, "shipped": 0.6}
 # For the last bias of what "ages" began from: on pictures of the pool, images were darker than
 # truth, by 0.05. What was made of it since is trained.
 LIFTS = {"ages": 0.03}
@@ -1042,7 +1043,7 @@ def report(folder: Path) -> None:
     done, seconds, lost = 0, 0.0, {}
     figure, axes = plt.subplots(figsize=(7, 3.5), layout="constrained")
     for name in STAGES:
-        if (folder / name).is_dir():  # else it ran elsewhere, and was reported there
+        if name not in CENTRED and (folder / name).is_dir():  # else it was reported where it ran
             stages[name] = record(folder / name)
         if name not in stages:
             settings, stop = STAGES[name]
