@@ -7,8 +7,9 @@ instead of y = K x + b, where m are the means of a layer's inputs in recent batc
 "Centering neural network gradient factors", 1998). The network and its parameters are the usual
 ones, and rates may be three times as high.
 
-The rate follows the clock. What is kept is a running mean of the weights: `last.npz`, written every
-four minutes, beside `log.jsonl`. On one core two seconds a step of four sequences.
+The rate follows the clock, so an interrupted run begins anew. What is kept is a running mean of the
+weights, `last.npz`, which is there when it has ended, beside `log.jsonl`. On one core two seconds a
+step of four sequences.
 """
 
 import json
@@ -28,7 +29,7 @@ from firenet_jax.training.run import first_state, sources_of
 from firenet_jax.training.settings import Train
 from firenet_jax.training.step import StepSettings, TrainState, _as_matrices, _simulated, loss_of
 
-LOGGED, SAVED = 50, 240.0  # steps, seconds
+LOGGED = 50  # steps between two lines
 LONGEST = 0.998  # of the running mean of the weights, per step
 
 # {"gru1": {"gates": leaf, ...}, ...}: one leaf for each convolution, (inputs,) or {kernel, bias}.
@@ -72,23 +73,18 @@ def input_means(params, tensors: jax.Array, state: State) -> Layers:
     return jax.tree.map(lambda each: each.mean(0), means)
 
 
+def is_layer(part) -> bool:
+    return "kernel" in part
+
+
 def each_layer(params, change, means: Layers):
     """Parameters, each layer's {kernel, bias} replaced by change(layer, means of its inputs)."""
-
-    def block(parts, inputs):
-        if "kernel" in parts:
-            return change(parts, inputs)
-        return {name: change(part, inputs[name]) for name, part in parts.items()}
-
-    return {name: block(parts, means[name]) for name, parts in params.items()}
+    return jax.tree.map(change, params, means, is_leaf=is_layer)
 
 
 def no_means(params) -> Layers:
     """Zeros."""
-    gru, block = {"gates": None, "candidate": None}, {"conv1": None, "conv2": None}
-    names = {"gru1": gru, "res1": block, "gru2": gru, "res2": block}
-    names |= {"head": None, "prediction": None}
-    return each_layer(params, lambda part, _: jnp.zeros(part["kernel"].shape[2]), names)
+    return jax.tree.map(lambda part: jnp.zeros(part["kernel"].shape[2]), params, is_leaf=is_layer)
 
 
 def of_centred(gradient, means: Layers):
@@ -152,8 +148,8 @@ def run_centred(settings: Train, minutes: float, rising: int = 60, sinking: floa
     moments = muon().init(state.params)
     means = no_means(state.params)
     kept, steps, seen = jax.tree.map(jnp.copy, state.params), 0, []
-    begun = saved = time.monotonic()
-    with (settings.output / "log.jsonl").open("a") as log:
+    begun = time.monotonic()
+    with (settings.output / "log.jsonl").open("w") as log:
         while (passed := (time.monotonic() - begun) / (60 * minutes)) < 1:
             falling = min(1.0, max(0.01, (1 - passed) / sinking))
             rate = settings.learning_rate * min(1, (steps + 1) / rising) * falling
@@ -173,8 +169,5 @@ def run_centred(settings: Train, minutes: float, rising: int = 60, sinking: floa
                 log.write(json.dumps({"step": steps, "rate": rate, "seconds": seconds} | mean))
                 log.write("\n")
                 seen = []
-            if time.monotonic() - saved > SAVED:
-                save_weights(settings.output / "last.npz", Weights(kept, True))
-                saved = time.monotonic()
     save_weights(settings.output / "last.npz", Weights(kept, True))
     return steps

@@ -4,7 +4,9 @@
     python experiments/train_default.py RUN --report-only       what it was and how it went
 
 Stages, each in a folder of its own under RUN and from the last weights of the one before; an
-interrupted one goes on where it was. First clean sensors and windows in which much moves, because
+interrupted one goes on where it was (one of `CENTRED` begins anew).
+
+First clean sensors and windows in which much moves, because
 there is most to learn from them; then the faults of real sensors, longer sequences and slower ones;
 then windows in which next to nothing moves, as in most recordings; then a sharper loss; then
 mostly clean sensors again; then a loss that sees faint structure and flicker; then objects before
@@ -950,11 +952,11 @@ def train(folder: Path, images: Path) -> None:
             path = folder / "woken" / "last.npz"
             weights = woken(weights, replace(settings, images=images), path)
         settings = replace(settings, output=folder / name, images=images, weights=weights)
-        if name in CENTRED:
-            run_centred(settings, **CENTRED[name])
-        else:
-            run(settings, stop)
         weights = folder / name / "last.npz"
+        if name not in CENTRED:
+            run(settings, stop)
+        elif not weights.exists():
+            run_centred(settings, **CENTRED[name])
     weights = average(folder, SHIPPED, folder / "weights.npz")
     remembering(folder, weights, weights, REMEMBERED["shipped"])
 
