@@ -1,9 +1,9 @@
-"""Muon or Adam: which learns more from the same steps?
+"""Muon, Muon with centred updates or Adam: which learns more from the same steps?
 
-    python experiments/compare_optimisers.py RUNS [--images PICTURES] [--steps 300]   15 minutes
+    python experiments/compare_optimisers.py RUNS [--images PICTURES] [--steps 300]   25 minutes
 
 Each candidate trains from the same seed, on the same sequences and for as many steps of 64x64
-pixels, in a folder of its own under RUNS (an interrupted comparison goes on); both optimisers with
+pixels, in a folder of its own under RUNS (an interrupted comparison goes on); each optimiser with
 two or more rates, because each has its own best one. Judged is the loss on the validation
 sequences of the run, which are the same for all. Writes results/compare_optimisers.json and .png.
 """
@@ -27,6 +27,8 @@ CANDIDATES = {
     "adam, rate 2.5e-3": {"optimiser": "adam", "learning_rate": 2.5e-3},
     "muon, rate 3e-3": {"optimiser": "muon", "learning_rate": 3e-3},
     "muon, rate 1e-2": {"optimiser": "muon", "learning_rate": 1e-2},
+    "centred, rate 3e-3": {"optimiser": "centred", "learning_rate": 3e-3},
+    "centred, rate 1e-2": {"optimiser": "centred", "learning_rate": 1e-2},
 }
 
 

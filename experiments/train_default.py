@@ -4,7 +4,7 @@
     python experiments/train_default.py RUN --report-only       what it was and how it went
 
 Stages, each in a folder of its own under RUN and from the last weights of the one before; an
-interrupted one goes on where it was (one of `CENTRED` begins anew).
+interrupted one goes on where it was.
 
 First clean sensors and windows in which much moves, because
 there is most to learn from them; then the faults of real sensors, longer sequences and slower ones;
@@ -17,8 +17,8 @@ sensors does; then detail where next to nothing moves; then sequences of hundred
 windows; then windows of any density, and noise alone; then specialists, of which a mean is made;
 then noise as it is in the dark; everything at once in large batches on a GPU; then, with the memory
 of what that began from, what makes pictures of the state; everything again on a GPU; more motion,
-with channels that had died drawn anew; and at last updates after which none dies (centred.py). Each
-was a lesson of the one before.
+with channels that had died drawn anew; and at last centred updates, after which none dies. Each was
+a lesson of the one before.
 
 PICTURES were 63: scikit-image's own (`textures.PHOTOGRAPHS`), matplotlib's sample data, and those
 photographs of the Debian packages lomiri-wallpapers-16.04 and -20.04, mate-backgrounds (nature,
@@ -71,7 +71,6 @@ import jax
 import matplotlib
 import numpy as np
 import tyro
-from centred import run_centred
 from dormant import RARE, active, last_block, second_maps
 from harness import RESULTS, save
 
@@ -774,8 +773,9 @@ AMPLE = replace(
     scene=replace(VAST.scene, halt=0.3),
     sensor=VAST.sensor,
 )
-# From where "ample" began, clean sensors alone, with centred updates (centred.py), so that the rate
-# may be three times as high: more than 370 and 700 steps before had brought, in 892.
+# From where "ample" began, clean sensors alone, with centred updates, so that the rate may be three
+# times as high: more than 370 and 700 steps before had brought, in 892. Here and in "hale" the rate
+# followed the clock, and what was kept is a running mean of the weights.
 BRISK = replace(
     KEEN,
     textures=4096,
@@ -784,7 +784,9 @@ BRISK = replace(
     chain=6,
     renderings=30,
     motion=(2.0, 30.0),
+    optimiser="centred",
     learning_rate=2e-3,
+    warmup=100,
     seed=711,
     loss=replace(
         KEEN.loss, contrast=3.0, haarpsi=0.5, equalised=4.0, equalised_mse=16.0, detail=0.0,
@@ -802,7 +804,9 @@ HALE = replace(
     crop=80,
     renderings=32,
     motion=(1.5, 32.0),
+    optimiser="centred",
     learning_rate=2e-3,
+    warmup=60,
     seed=722,
     sensor=replace(AMPLE.sensor, clean=0.3),
 )
@@ -853,12 +857,6 @@ STAGES = {
     "ample": (AMPLE, None),
     "brisk": (BRISK, None),
     "hale": (HALE, None),
-}
-# Those with centred updates: minutes, of which the rate sinks in the last part, after so many steps
-# in which it rises.
-CENTRED = {
-    "brisk": {"minutes": 28.0, "rising": 100, "sinking": 0.35},
-    "hale": {"minutes": 26.0},
 }
 # Parts of a mean: what a stage starts from, if not from the one before.
 FIRST = {"even": 1, "usual": 1, "settle": 1, "natural": 9}
@@ -953,10 +951,7 @@ def train(folder: Path, images: Path) -> None:
             weights = woken(weights, replace(settings, images=images), path)
         settings = replace(settings, output=folder / name, images=images, weights=weights)
         weights = folder / name / "last.npz"
-        if name not in CENTRED:
-            run(settings, stop)
-        elif not weights.exists():
-            run_centred(settings, **CENTRED[name])
+        run(settings, stop)
     weights = average(folder, SHIPPED, folder / "weights.npz")
     remembering(folder, weights, weights, REMEMBERED["shipped"])
 
@@ -1045,7 +1040,7 @@ def report(folder: Path) -> None:
     done, seconds, lost = 0, 0.0, {}
     figure, axes = plt.subplots(figsize=(7, 3.5), layout="constrained")
     for name in STAGES:
-        if name not in CENTRED and (folder / name).is_dir():  # else it was reported where it ran
+        if (folder / name).is_dir():  # else it was reported where it ran
             stages[name] = record(folder / name)
         if name not in stages:
             settings, stop = STAGES[name]

@@ -378,7 +378,7 @@ def test_settings_that_cannot_be_are_one_sentence(here, capsys, line, said):
         (f"{RUN} --unit x", "--unit: expected s or ms or us or ns, not 'x'"),
         (f"{RUN} --names x", "--names: expected number or nanoseconds, not 'x'"),
         ("simulate -o set --noise 1 much", "--noise: expected 2 numbers, not '1 much'"),
-        ("train -o run --optimiser sgd", "--optimiser: expected muon or adam, not 'sgd'"),
+        ("train -o run --optimiser sgd", "--optimiser: expected muon or centred or adam"),
     ],
 )  # fmt: skip
 def test_words_that_cannot_be_read_are_said_without_pythons(here, capsys, monkeypatch, line, said):

@@ -51,7 +51,7 @@ SMALL = {
     "voxelisation": "--events 10000 --runs 1 --repeats 1",
     "xla_vs_pytorch": "--quick --parts pipeline",
 }
-SHARED = {"centred", "figures", "harness", "pytorch_firenet"}  # no scripts: what others import
+SHARED = {"figures", "harness", "pytorch_firenet"}  # no scripts: what others import
 # "browser" needs one: test_web_page.py uses its parts where there is one.
 ELSEWHERE = {"browser", "model_card"}
 

@@ -36,6 +36,7 @@ from firenet_jax.simulation.sensor import (
     to_and_fro,
 )
 from firenet_jax.tensors import normalise
+from firenet_jax.training.centring import centred, input_means
 from firenet_jax.training.losses import Loss, sequence_loss
 
 TEXTURE = 256  # pixels on a side of a texture
@@ -62,7 +63,7 @@ class StepSettings:
     to_and_fro: float
     learning_rate: float
     warmup: int
-    optimiser: Literal["muon", "adam"]
+    optimiser: Literal["muon", "centred", "adam"]
     clip: float
     frozen: tuple[str, ...]
     bfloat16: bool
@@ -89,17 +90,20 @@ def optimiser(settings: StepSettings) -> optax.GradientTransformation:
 
     Muon (Jordan et al. 2024) orthogonalises the update of a kernel, as a matrix (9 inputs,
     outputs); 0.2 is the usual root mean square of Adam's updates (Liu et al., arXiv 2502.16982).
-    Biases and the 1x1 convolution always use Adam.
+    Biases and the 1x1 convolution always use Adam. "centred" is Muon, too, but with gradients and
+    updates of centred inputs (`centring`); its `update` takes their means.
     """
     rate = optax.warmup_cosine_decay_schedule(
         0.0, settings.learning_rate, settings.warmup, settings.steps, settings.learning_rate / 100
     )
     update = optax.adam(rate)
-    if settings.optimiser == "muon":
+    if settings.optimiser != "adam":
         update = optax.contrib.muon(
             rate, consistent_rms=0.2, muon_weight_dimension_numbers=_as_matrices
         )
     update = optax.chain(optax.clip_by_global_norm(settings.clip), update)
+    if settings.optimiser == "centred":
+        update = optax.GradientTransformationExtraArgs(*centred(update))
     return optax.apply_if_finite(update, max_consecutive_errors=10)
 
 
@@ -297,10 +301,25 @@ def _updated(
     """(state, data, the network's state before it) -> (state, losses), the network's state."""
     both = jax.value_and_grad(loss_of, has_aux=True)
     (loss, (terms, last, _)), gradient = both(state.params, data, before, warm, settings, near)
-    updates, optimised = optimiser(settings).update(gradient, state.optimiser, state.params)
+    more = {}
+    if settings.optimiser == "centred":
+        more = {"means": _input_means(state.params, data, last)}
+    update = optimiser(settings).update
+    updates, optimised = update(gradient, state.optimiser, state.params, **more)
     params = optax.apply_updates(state.params, updates)
     terms = {"loss": loss, "gradient": optax.tree.norm(gradient), **terms}
     return state._replace(params=params, optimiser=optimised, step=state.step + 1), terms, last
+
+
+def _input_means(params, data: Simulation, last: State):
+    """Means of each layer's inputs: those of one window more, which is the last one again."""
+
+    def one_device(params, state, tensors):
+        means = input_means(params, state, normalise(tensors)[0])
+        return jax.lax.pmean(means, "devices")
+
+    on_each = on_each_device(one_device, (REPLICATED, BATCH, TIME_BATCH), REPLICATED)
+    return on_each(params, last, data.tensors[-1:])
 
 
 @partial(jax.jit, static_argnames="settings", donate_argnames="state")
