@@ -14,7 +14,7 @@ from firenet_jax.network import initial_state
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.simulation import sensor as module
 from firenet_jax.simulation.curricula import random_setups, sequences, window_bounds
-from firenet_jax.simulation.scenes import SceneSettings, rendering_times, video
+from firenet_jax.simulation.scenes import SceneSettings, rendering_times, speeds, video
 from firenet_jax.simulation.sensor import (
     EPS,
     FAULTY,
@@ -787,17 +787,15 @@ def test_the_runs_of_given_pictures_vote_as_their_events_do():
     sensor = random_sensor(jax.random.key(9), height=H, width=W, settings=FAULTY)
     times = np.array([0, 3000, 7001, 9000, 14_000])
     images = (np.exp(random_logs(10, times)) - EPS).astype(np.float32)
-    state, planes = module.first_state(sensor, jnp.asarray(images[0])), np.zeros((5, 1, H, W), "f4")
+    state, planes = module.first_state(sensor, jnp.asarray(images[0])), np.zeros((5, H, W), "f4")
     one_step, votes = jax.jit(module.step), jax.jit(module._votes)
     for k in range(1, len(times)):
         duration = jnp.int32(times[k] - times[k - 1])
         state, runs = one_step(sensor, state, jnp.asarray(images[k]), duration)
-        batch = jax.tree.map(lambda leaf: leaf[None], runs)
-        passed, total = (np.array([t], np.int32) for t in (times[k - 1], times[-1]))
-        planes = votes(planes, 0, batch, passed, total)
+        planes = votes(planes, 0, runs, jnp.int32(times[k - 1]), jnp.int32(times[-1]))
     events = concatenate(list(event_list(sensor, zip(times, images, strict=True))))
     tensor = voxelise(pack([[events]], bounds=np.array([[[0, times[-1]]]])), height=H, width=W)
-    planes = np.asarray(planes)[:, 0].transpose(1, 2, 0)
+    planes = np.asarray(planes).transpose(1, 2, 0)
     np.testing.assert_allclose(planes, tensor[0, 0], atol=2e-5)
     assert int(state.renderings) == 4
 
@@ -893,3 +891,44 @@ def test_no_threshold_is_below_a_hundredth():
     sensor = random_sensor(jax.random.key(3), height=40, width=40, settings=settings)
     for threshold in (sensor.on, sensor.off):
         assert threshold.min() == np.float32(0.01)
+
+
+def of_both(bounds):
+    """(T + 1,) of the slow scene and (T + 1,) of the fast one -> (T + 1, 2) int32."""
+    return jnp.stack([jnp.asarray(each, jnp.int32) for each in bounds], 1)
+
+
+@pytest.mark.optimised
+def test_each_sequence_has_the_renderings_that_it_needs(setups):
+    """One at rest has the fewest, one that is fast the most, as if each were alone."""
+    sensors, scenes, _ = setups
+    sensors = sensors._replace(lamp=sensors.lamp._replace(swing=0 * sensors.lamp.swing))
+    fewest, most = 3, 9
+    lengths = 0.05 / scenes.speed[0], 2 * most / scenes.speed[1]  # of windows: pixels
+    bounds = of_both([np.arange(4) * int(1e6 * length) for length in lengths])
+    sensors = sensors._replace(noise=sensors.noise * jnp.array([[0, 1, 1]]))
+    made = simulate(sensors, scenes, bounds, renderings=(fewest, most), **SQUARE)[1]
+    for b, number in enumerate((fewest, most)):
+        alone = simulate(sensors, scenes, bounds, renderings=number, **SQUARE)[1]
+        assert jnp.abs(alone.tensors[:, b]).max() > 0
+        for ours, expected in zip(made, alone, strict=True):
+            np.testing.assert_allclose(ours[:, b], expected[:, b], atol=1e-3)
+
+
+def test_renderings_are_half_a_pixel_apart_and_enough_for_noise_and_light(setups):
+    sensors, scenes, bounds = setups
+    sensor, scene = of_sequence(sensors, 1), of_sequence(scenes, 1)
+    sensor = sensor._replace(
+        noise=jnp.array([0.0, 1.0, 1.0]), lamp=sensor.lamp._replace(swing=jnp.zeros((SIZE, SIZE)))
+    )
+    bounds = jnp.arange(7, dtype=jnp.int32) * 40_000
+    needed = partial(module.renderings_needed, least=1, most=10_000, **SQUARE)
+    counts = needed(sensor, scene, bounds)
+    times = 1e-6 * np.linspace(bounds[:-1], bounds[1:], 33)
+    fastest = np.stack([speeds(scene, each, **SQUARE) for each in times.T]).max(1)
+    apart = fastest * 0.04 / counts
+    assert (apart <= 0.52).all() and apart.mean() > 0.3
+    noisy = sensor._replace(noise=jnp.array([5000.0, 1.0, 1.0]))
+    np.testing.assert_array_equal(needed(noisy, scene, bounds), 2 * 5000 * 0.04)
+    lit = sensor._replace(lamp=sensor.lamp._replace(swing=jnp.full((SIZE, SIZE), 0.1)))
+    assert (needed(lit, scene, bounds) == 10_000).all()

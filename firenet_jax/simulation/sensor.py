@@ -36,7 +36,7 @@ from jax.typing import ArrayLike
 from firenet_jax.errors import SettingsError
 from firenet_jax.events import BINS, Events, concatenate
 from firenet_jax.settings import check_range, check_share, check_sizes
-from firenet_jax.simulation.scenes import Scene, flow, log_uniform, render
+from firenet_jax.simulation.scenes import Scene, flow, log_uniform, render, speeds
 
 EPS = 0.001
 THRESHOLD, SPREAD, REFRACTORY = 0.18, 0.03, 1e-3  # defaults, as in the paper
@@ -536,45 +536,85 @@ def simulate(
     *,
     height: int,
     width: int,
-    renderings: int = 5,
+    renderings: int | tuple[int, int] = 5,
 ) -> tuple[SensorState, Simulation]:
     """B sensors before B scenes -> event tensors and truth, all on the device.
 
     bounds: (T + 1, B) int32, microseconds since the scenes' start; window t lasts from t to t + 1.
     state: what the last call returned, to go on where it ended; None starts afresh.
     renderings: number in each window, equally spaced. Nothing moves by more than a pixel between
-    two if windows last at most renderings / scene.speed seconds.
+    two if windows last at most renderings / scene.speed seconds. Or the fewest and the most: on a
+    CPU only as many as a window needs (`renderings_needed`); elsewhere the most, because sequences
+    are simulated side by side, and one of them needs it.
     """
-    draw = partial(_draw, height=height, width=width)
-    move = jax.vmap(partial(flow, height=height, width=width))
-    shape = bounds.shape[1], height, width
     if state is None:
         state = first_states(sensors, scenes, bounds[0], height=height, width=width)
+    least, most = (renderings, renderings) if isinstance(renderings, int) else renderings
+    one = partial(_one_sequence, size=(height, width), least=least)
+    side_by_side = jax.vmap(partial(one, counts=most), out_axes=(0, 1))
+    needed = partial(renderings_needed, height=height, width=width, least=least, most=most)
 
-    # A loop over the renderings of a window: unrolled, they take twice as long to compile.
-    span = min(-(-(BINS - 1) // renderings) + 2, BINS)  # bins that votes of one rendering reach
+    def one_by_one(*given):
+        counts = jax.vmap(needed)(*given[:3])
+        state, made = jax.lax.map(lambda each: one(*each), (*given, counts))
+        return state, jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), made)
 
-    def window(state, ends):
-        start, end = ends  # (B,)
+    given = sensors, scenes, bounds.T, state
+    if least == most:
+        return side_by_side(*given)
+    return jax.lax.platform_dependent(*given, cpu=one_by_one, default=side_by_side)
 
-        def rendering(carry, k):
+
+def renderings_needed(
+    sensor: Sensor, scene: Scene, bounds: jax.Array, *, height: int, width: int, least, most
+) -> jax.Array:
+    """(T + 1,) int32 microseconds -> (T,) int32, how many renderings each window needs.
+
+    As many that nothing moves by more than half a pixel between two, and that there is at most one
+    event of noise in two of them; `most` where light flickers.
+    """
+    duration = 1e-6 * jnp.diff(bounds)
+    times = 1e-6 * bounds[:-1, None] + duration[:, None] * jnp.array([[0.0, 0.5, 1.0]])
+    seen = speeds(scene, times.ravel(), height=height, width=width).reshape(times.shape)
+    needed = duration * 1.1 * seen.max(-1) / 0.5  # 10 % for what is faster between these times
+    if sensor.noise is not None:
+        needed = jnp.maximum(needed, 2 * duration * sensor.noise[0])
+    if sensor.lamp is not None:
+        needed = jnp.where(sensor.lamp.swing.max() > 0, most, needed)
+    return jnp.clip(jnp.ceil(needed), least, most).astype(jnp.int32)
+
+
+def _one_sequence(sensor, scene, bounds, state, counts, *, size: tuple[int, int], least: int):
+    """`simulate` without its axis of the batch; size: height and width.
+
+    counts: (T,) int32 or a number, renderings in each window, `least` or more.
+    """
+    # Bins that votes of one rendering reach.
+    span = min(-(-(BINS - 1) // least) + 2, BINS)
+    height, width = size
+
+    def window(state, inputs):
+        start, end, number = inputs
+        count = counts if isinstance(counts, int) else counts[number]
+
+        def rendering(k, carry):
             state, planes, passed, _ = carry
-            until = (k + 1) * (end - start) // renderings
-            image = draw(scenes, 1e-6 * (start + until))
-            state, runs = jax.vmap(step)(sensors, state, image, until - passed)
-            low = jnp.minimum((BINS - 1) * k // renderings, BINS - span)
+            until = (k + 1) * (end - start) // count
+            image = render(scene, 1e-6 * (start + until), height=height, width=width).image
+            state, runs = step(sensor, state, image, until - passed)
+            low = jnp.minimum((BINS - 1) * k // count, BINS - span)
             votes = jax.lax.dynamic_slice_in_dim(planes, low, span)
             votes = _votes(votes, low, runs, passed, end - start)
             planes = jax.lax.dynamic_update_slice_in_dim(planes, votes, low, 0)
-            return (state, planes, until, image), None
+            return state, planes, until, image
 
-        planes, image = jnp.zeros((BINS, *shape)), jnp.zeros(shape)
+        planes, image = jnp.zeros((BINS, height, width)), jnp.zeros((height, width))
         carry = state, planes, jnp.zeros_like(start), image
-        (state, planes, _, image), _ = jax.lax.scan(rendering, carry, jnp.arange(renderings))
-        displacement, visible = move(scenes, 1e-6 * start, 1e-6 * end)
-        return state, Simulation(planes.transpose(1, 2, 3, 0), image, displacement, visible)
+        state, planes, _, image = jax.lax.fori_loop(0, count, rendering, carry)
+        displacement, visible = flow(scene, 1e-6 * start, 1e-6 * end, height=height, width=width)
+        return state, Simulation(planes.transpose(1, 2, 0), image, displacement, visible)
 
-    return jax.lax.scan(window, state, (bounds[:-1], bounds[1:]))
+    return jax.lax.scan(window, state, (bounds[:-1], bounds[1:], jnp.arange(len(bounds) - 1)))
 
 
 def to_and_fro(
@@ -599,13 +639,12 @@ def to_and_fro(
 
 
 def _votes(planes: jax.Array, low, runs, passed: jax.Array, total: jax.Array) -> jax.Array:
-    """Adds the votes of runs (B, H, W) by Eq. 1 to planes (n, B, H, W), the bins from `low` on.
+    """Adds the votes of runs (H, W) by Eq. 1 to planes (n, H, W), the bins from `low` on.
 
-    passed: (B,) int32, microseconds from the window's start to the interval's; total: duration of
+    passed: () int32, microseconds from the window's start to the interval's; total: duration of
     the window. Events of a pixel are processed one after the other, all pixels in parallel, up to
     the count of the busiest one.
     """
-    passed, total = passed[:, None, None], total[:, None, None]
     scale = (BINS - 1) / total.astype(jnp.float32)
 
     def vote(planes, run, number):

@@ -68,7 +68,7 @@ class Train:
     """Truncated back-propagation through time: carry the state through up to this many steps.
     Sequences of a batch differ in length, in a geometric series (64, batch 4: 3, 8, 23, 64)."""
     renderings: int = 5
-    """Renderings per window."""
+    """Greatest number of renderings per window; on a CPU there are fewer where less moves."""
     motion: tuple[float, float] = (1.25, 2.5)
     """Pixels by which the fastest point moves in a window, at most one per rendering; drawn
     log-uniformly for each sequence."""

@@ -40,6 +40,7 @@ from firenet_jax.training.centring import centred, input_means
 from firenet_jax.training.losses import Loss, sequence_loss
 
 TEXTURE = 256  # pixels on a side of a texture
+FEWEST = 5  # renderings of a window in which next to nothing moves
 NEIGHBOURHOOD = 9  # pixels: the side of the square around an event in which the truth counts
 
 
@@ -201,7 +202,8 @@ def _simulated(
             seen = jax.tree.map(partial(choose, simulated > 0), carried[0], seen)
             remembered = jax.tree.map(partial(choose, parts > 0), carried[1], remembered)
         size = {"height": settings.crop, "width": settings.crop}
-        seen, data = simulate(sensors, scenes, bounds, seen, renderings=settings.renderings, **size)
+        renderings = min(FEWEST, settings.renderings), settings.renderings
+        seen, data = simulate(sensors, scenes, bounds, seen, renderings=renderings, **size)
         if settings.to_and_fro and state is not None:  # validation is the same with and without
             choose = jax.vmap(partial(jnp.where), (0, 1, 1), 1)
             data = jax.tree.map(
