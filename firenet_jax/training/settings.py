@@ -87,9 +87,9 @@ class Train:
     warmup: int = 200
     """Steps of the linear warm-up. If it is not chosen, at most a fifth of the run."""
     optimiser: Literal["muon", "centred", "adam"] = "muon"
-    """muon learns more per step (experiments/compare_optimisers.py); the paper used adam. centred
-    is muon whose updates do not shift all that follows, so that no channel dies at a high rate. The
-    learning rate has the same scale for all: the size of an update."""
+    """muon learns more per step (experiments/compare_optimisers.py); the paper used adam. With
+    centred, muon too, no channel dies at a high rate. The learning rate has the same scale for all:
+    the size of an update."""
     clip: float = 1.0
     """Clip gradients to this norm."""
     frozen: tuple[Block, ...] = ()
