@@ -21,7 +21,10 @@ from firenet_jax.training.batches import Augment, is_set
 from firenet_jax.training.losses import DISTANCES, Loss
 from firenet_jax.training.step import StepSettings
 
-Block = Literal["head", "gru1", "res1", "gru2", "res2", "prediction"]
+Part = Literal[
+    "head", "gru1", "gru1.gates", "gru1.candidate", "res1",
+    "gru2", "gru2.gates", "gru2.candidate", "res2", "prediction",
+]  # fmt: skip
 SIMULATED = (  # settings of sequences that are simulated
     "images", "textures", "procedural", "renderings", "motion", "slow", "swift", "to_and_fro",
     "scene", "sensor",
@@ -92,8 +95,8 @@ class Train:
     the size of an update."""
     clip: float = 1.0
     """Clip gradients to this norm."""
-    frozen: tuple[Block, ...] = ()
-    """Blocks of the network that keep the weights they start from."""
+    frozen: tuple[Part, ...] = ()
+    """Parts of the network that keep the weights they start from."""
     seed: int = 0
     """Random seed of the initial parameters, the textures and the sequences."""
     bfloat16: bool = False

@@ -263,6 +263,19 @@ def near_events(tensors: jax.Array) -> jax.Array:
     return jax.lax.cummax(there) > 0
 
 
+def with_frozen(params, frozen: tuple[str, ...]):
+    """The same parameters. Those of `frozen` parts ("gru2", or "gru2.candidate") have a gradient of
+    zero, which is not computed, and by which no optimiser moves them.
+    """
+
+    def one(path, leaf):
+        name = jax.tree_util.keystr(path, simple=True, separator=".")
+        return jax.lax.stop_gradient(leaf) if name.startswith(prefixes) else leaf
+
+    prefixes = tuple(f"{part}." for part in frozen)
+    return jax.tree_util.tree_map_with_path(one, params)
+
+
 def loss_of(
     params, data: Simulation, state: State | None, warm, settings: StepSettings, near=False
 ):
@@ -274,8 +287,7 @@ def loss_of(
         level = data.images.mean((-2, -1), keepdims=True)
         there = near_events(data.tensors) | near
         data = data._replace(images=jnp.where(there, data.images, level))
-    # Frozen blocks have a gradient of zero: it is not computed, and no optimiser moves them by it.
-    params = params | {k: jax.lax.stop_gradient(params[k]) for k in settings.frozen}
+    params = with_frozen(params, settings.frozen)
 
     def one_device(params, data, state, warm):
         last, images = images_of(params, data.tensors, settings, state)
