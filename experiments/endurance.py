@@ -17,6 +17,9 @@ given, ours=PATH. The questions, each a function, an entry of results/endurance.
                 reconstruct`.
     contrast    what `firenet reconstruct RECORDING` shows: grey levels' standard deviation, and
                 how much the mean brightness moves from one picture to the next.
+    clip        the same of videos of held-out photographs before a moving camera, made into events
+                by `firenet simulate --video`; beside the video's own, and what `firenet evaluate`
+                says of each.
     frames      recordings with camera frames: SSIM and MSE, with and without local equalisation.
 
 What other weights gave before stays in the file, so that only new ones must be measured.
@@ -36,11 +39,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from harness import RESULTS, save
-from PIL import Image
+from PIL import Image, ImageOps
 from skimage.metrics import structural_similarity
+from skimage.transform import AffineTransform, warp
 
 import firenet_jax as fj
+from firenet_jax.commands.evaluate import Evaluate
+from firenet_jax.commands.evaluate import run as evaluate
 from firenet_jax.commands.reconstruct import Reconstruct, run
+from firenet_jax.commands.simulate import Simulate
+from firenet_jax.commands.simulate import run as make_events
 from firenet_jax.evaluation import metrics
 from firenet_jax.evaluation.equalise import equalise
 from firenet_jax.instants import WARM_UP
@@ -72,6 +80,7 @@ WARM, JUDGED = 30, 10  # windows of a sequence of one density
 FLICKER = (0.1, 0.9)
 USUAL, LONGEST = 0.35, 40_000.0  # events per pixel, microseconds: windows of `firenet reconstruct`
 PIXELS = 40.0  # by which a window of a density moves, at most: one for each rendering
+CLIP_RATE, CLIP_PICTURES = 100.0, 400
 WITH_FRAMES = ("davis346_59_frames.aedat4", "ecd_slider_depth", "davis346_frames.aedat4")
 
 Methods = dict[str, Weights]
@@ -344,6 +353,41 @@ def contrast(files: dict[str, Path | None], recordings: list[Path]) -> list[dict
     return rows
 
 
+def clip(files: dict[str, Path | None]) -> list[dict]:
+    rows = []
+    for photograph in photographs(HELD_OUT):
+        pictures = moving(photograph)
+        truth = {"deviation of truth": float(np.std(pictures, (-2, -1)).mean())}
+        with tempfile.TemporaryDirectory() as folder:
+            video, events = Path(folder) / "clip.mp4", Path(folder) / f"{photograph.stem}.h5"
+            fj.write_video(video, pictures, CLIP_RATE)
+            make_events(Simulate(events, video=video))
+            shown = contrast(files, [events])
+            for row, (name, weights) in zip(shown, files.items(), strict=True):
+                of = (weights or Path("built-in"),)
+                judged = Evaluate((events,), Path(folder) / name, methods="firenet", weights=of)
+                (sequence,) = evaluate(judged)["sequences"].values()
+                (found,) = sequence["methods"].values()
+                means = {key: found["means"][key] for key in ("ssim", "mse")}
+                rows.append(row | {"recording": photograph.stem} | truth | means)
+    return rows
+
+
+def moving(photograph: Path) -> list[np.ndarray]:
+    """What a camera sees that moves, turns and nears before a photograph: (180, 240) uint8."""
+    with Image.open(photograph) as file:
+        picture = np.asarray(ImageOps.fit(file.convert("L"), (480, 360)), np.float32)
+    found = []
+    for phase in np.arange(CLIP_PICTURES) / CLIP_RATE:
+        zoom, angle = 1.0 + 0.15 * np.sin(1.3 * phase), 0.15 * np.sin(1.9 * phase)
+        place = 240 + 60 * np.sin(1.7 * phase), 180 + 40 * np.sin(2.3 * phase)
+        to_middle = AffineTransform(translation=(-120, -90))
+        there = AffineTransform(scale=zoom, rotation=angle, translation=place)
+        seen = warp(picture, to_middle + there, output_shape=(180, 240), preserve_range=True)
+        found.append(np.uint8(np.rint(seen)))
+    return found
+
+
 def warmed(weights: Weights, state: State, first: list[jax.Array]) -> State:
     """The state after the warm-up of `firenet reconstruct`, from tensors (1, B, H, W, 5)."""
     for tensors in [*first, *(-tensors[..., ::-1] for tensors in reversed(first))]:
@@ -414,6 +458,7 @@ def frames(methods: Methods, recordings: list[Path]) -> list[dict]:
 
 SIMULATED = {"long": long, "rest": rest, "density": density, "light": light}
 RECORDED = {"palindrome": palindrome, "frames": frames, "contrast": contrast}
+SHOWN = {"contrast": contrast, "clip": clip}  # by commands, which take files of weights
 
 
 def _readable(path: Path) -> bool:
@@ -439,7 +484,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("weights", nargs="+", help="built-in, FILE or NAME=FILE")
     parser.add_argument("--recordings", type=Path, help="a folder of them")
-    parser.add_argument("--only", nargs="*", default=[*SIMULATED, *RECORDED])
+    parser.add_argument("--only", nargs="*", default=[*SIMULATED, *RECORDED, "clip"])
     parser.add_argument("--sequences", type=int, default=16, help="simulated, of each condition")
     options = parser.parse_args()
     files = {}
@@ -452,14 +497,16 @@ def main():
     last = RESULTS / "endurance.json"
     results = json.loads(last.read_text()) if last.exists() else {}
     results.pop("machine", None)
-    for name, function in (SIMULATED | RECORDED).items():
+    for name, function in (SIMULATED | RECORDED | SHOWN).items():
         if name not in options.only or (name in RECORDED and not recordings):
             continue
+        rows = function(
+            files if name in SHOWN else methods,
+            *([options.sequences] if name in SIMULATED else []),
+            *([recordings] if name in RECORDED else []),
+        )
         if name in SIMULATED:
-            rows = function(methods, options.sequences)
             rows = [{**row, "sequences": options.sequences} for row in rows]
-        else:
-            rows = function(files if function is contrast else methods, recordings)
         print(f"\n{name}")
         table(rows)
         others = [row for row in results.get(name, []) if row["weights"] not in methods]

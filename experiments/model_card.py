@@ -81,6 +81,17 @@ def rest(shipped: dict, endurance: dict) -> list[list[str]]:
     ]
 
 
+def clip(shipped: dict, endurance: dict) -> list[list[str]]:
+    found = {(row["recording"], row["weights"]): row for row in endurance["clip"]}
+    return [
+        [of, NAMES[name]]
+        + [f"{found[of, name][key]:.{n}f}" for key, n in (("mse", 4), ("ssim", 3))]
+        + [f"{found[of, name]['deviation']:.0f} ({found[of, name]['deviation of truth']:.0f})"]
+        for of in dict.fromkeys(key[0] for key in found)
+        for name in NAMES
+    ]
+
+
 def frames(shipped: dict, endurance: dict) -> list[list[str]]:
     found = {(r["recording"], r["warm_up"], r["weights"]): r for r in endurance["frames"]}
     keys = {"mse": 3, "ssim": 3, "mse_equalised": 3, "ssim_equalised": 3}
@@ -97,6 +108,7 @@ TABLES = {
     ("sensor", "weights"): density,
     ("camera", "light"): light,
     ("noise", "weights"): rest,
+    ("photograph", "weights"): clip,
     ("recording", "warm-up"): frames,
 }
 

@@ -27,7 +27,7 @@ SMALL = {
     "compare_losses": "{folder}/runs --steps 1 --only l1",
     "compare_optimisers": "{folder}/runs --steps 1 --only 'muon, rate 3e-3'",
     "dormant": str(WEIGHTS),
-    "endurance": f"{WEIGHTS} --recordings {{folder}} --only palindrome contrast",
+    "endurance": f"{WEIGHTS} --recordings {{folder}} --only palindrome contrast clip",
     "exactness": "--cases 1",
     "figure3_qualitative": "--seconds 0.2",
     "figure4_high_speed": "--seconds 0.1 --windows 4",
@@ -72,7 +72,10 @@ SMALLER = {
         "windows=16,": "windows=11,",
     },
     "dormant": {"batch=4, windows=30": "batch=1, windows=10"},
-    "endurance": {"ROUNDS = 40": "ROUNDS = 2"},
+    "endurance": {
+        "ROUNDS = 40": "ROUNDS = 2",
+        "CLIP_PICTURES = 100.0, 400": "CLIP_PICTURES = 100.0, 8",
+    },
     "figure4_high_speed": {
         '"height": 480, "width": 640': '"height": 120, "width": 160',
         "EVENTS, SPEED, MOMENTS = 50_000": "EVENTS, SPEED, MOMENTS = 2_000",
