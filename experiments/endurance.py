@@ -1,6 +1,6 @@
 """How do weights behave over length, density, rest and contrast, beside those of others?
 
-    python experiments/endurance.py WEIGHTS... [--recordings FOLDER] [--only NAMES]      60 minutes
+    python experiments/endurance.py WEIGHTS... [--recordings FOLDER] [--only NAMES]      65 minutes
 
 WEIGHTS: "built-in", and files of others (the published checkpoint, FireNet+, ...); a name may be
 given, ours=PATH. The questions, each a function, an entry of results/endurance.json and a table:
@@ -354,6 +354,7 @@ def contrast(files: dict[str, Path | None], recordings: list[Path]) -> list[dict
 
 
 def clip(files: dict[str, Path | None]) -> list[dict]:
+    """Means over all pictures; those that are judged are of windows between the video's."""
     rows = []
     for photograph in photographs(HELD_OUT):
         pictures = moving(photograph)
@@ -458,7 +459,7 @@ def frames(methods: Methods, recordings: list[Path]) -> list[dict]:
 
 SIMULATED = {"long": long, "rest": rest, "density": density, "light": light}
 RECORDED = {"palindrome": palindrome, "frames": frames, "contrast": contrast}
-SHOWN = {"contrast": contrast, "clip": clip}  # by commands, which take files of weights
+FILMED = {"clip": clip}
 
 
 def _readable(path: Path) -> bool:
@@ -484,7 +485,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("weights", nargs="+", help="built-in, FILE or NAME=FILE")
     parser.add_argument("--recordings", type=Path, help="a folder of them")
-    parser.add_argument("--only", nargs="*", default=[*SIMULATED, *RECORDED, "clip"])
+    parser.add_argument("--only", nargs="*", default=[*SIMULATED, *RECORDED, *FILMED])
     parser.add_argument("--sequences", type=int, default=16, help="simulated, of each condition")
     options = parser.parse_args()
     files = {}
@@ -497,14 +498,13 @@ def main():
     last = RESULTS / "endurance.json"
     results = json.loads(last.read_text()) if last.exists() else {}
     results.pop("machine", None)
-    for name, function in (SIMULATED | RECORDED | SHOWN).items():
+    given = dict.fromkeys(SIMULATED, (methods, options.sequences))
+    given |= dict.fromkeys(RECORDED, (methods, recordings))
+    given |= {"contrast": (files, recordings), "clip": (files,)}  # by commands, which take files
+    for name, function in (SIMULATED | RECORDED | FILMED).items():
         if name not in options.only or (name in RECORDED and not recordings):
             continue
-        rows = function(
-            files if name in SHOWN else methods,
-            *([options.sequences] if name in SIMULATED else []),
-            *([recordings] if name in RECORDED else []),
-        )
+        rows = function(*given[name])
         if name in SIMULATED:
             rows = [{**row, "sequences": options.sequences} for row in rows]
         print(f"\n{name}")

@@ -1048,27 +1048,30 @@ def train(folder: Path, images: Path) -> None:
         weights = folder / name / "last.npz"
         run(settings, stop)
     weights = average(folder, SHIPPED, folder / "weights.npz")
-    gates = average(folder, FORMER, folder / "former.npz")
-    with_parts(weights, gates=gates, candidate=folder / "before_sound.npz")
+    gates = second_gru(average(folder, FORMER, folder / "former.npz"))["gates"]
+    candidate = second_gru(folder / "before_sound.npz")["candidate"]
+    with_parts(weights, gates=gates, candidate=candidate)
 
 
-def with_parts(path: Path, **others: Path) -> None:
-    """Gives the second ConvGRU of the weights at `path` these parts of other weights'."""
+def second_gru(path: Path) -> dict:
+    """Parameters of the second ConvGRU of the weights at `path`."""
+    return load_weights(path).params["gru2"]
+
+
+def with_parts(path: Path, **parts) -> Path:
+    """Gives the second ConvGRU of the weights at `path` these parts."""
     weights = load_weights(path)
-    parts = {name: load_weights(other).params["gru2"][name] for name, other in others.items()}
     gru2 = weights.params["gru2"] | parts
     save_weights(path, replace(weights, params=weights.params | {"gru2": gru2}))
+    return path
 
 
 def remembering(folder: Path, path: Path, other: Path, share: float) -> Path:
     """Gives the weights at `path` the memory of those at `other`, with this share of DUSKY's."""
-    weights = load_weights(path)
-    own = load_weights(other).params["gru2"]["candidate"]
-    dusky = load_weights(average(folder, DUSKY, folder / "dusky.npz")).params["gru2"]["candidate"]
-    candidate = jax.tree.map(lambda a, b: (1 - share) * a + share * b, own, dusky)
-    gru2 = weights.params["gru2"] | {"candidate": candidate}
-    save_weights(path, replace(weights, params=weights.params | {"gru2": gru2}))
-    return path
+    own = second_gru(other)["candidate"]
+    dusky = second_gru(average(folder, DUSKY, folder / "dusky.npz"))["candidate"]
+    mix = jax.tree.map(lambda a, b: (1 - share) * a + share * b, own, dusky)
+    return with_parts(path, candidate=mix)
 
 
 def woken(path: Path, settings: Train, made: Path) -> Path:
