@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
+from firenet_jax.errors import RecordingError
 from firenet_jax.readers import open_recording
 from firenet_jax.storage.arrays import ArraysWriter
 from firenet_jax.storage.bag import BagWriter, check_topic
@@ -213,7 +214,7 @@ def test_a_disk_that_is_full_at_the_very_end_leaves_the_bag_before(tmp_path, mon
 def test_what_a_bag_cannot_say(tmp_path):
     pytest.importorskip("rosbags")
     writer = BagWriter(tmp_path / "a.bag", "/image", "cam0")
-    with pytest.raises(OutputError, match="ROS counts from 0"):
+    with pytest.raises(RecordingError, match="ROS counts from 0"):
         writer.write(pictures()[0], -1)
     for topic in ("", "/", "a b", "/cam0//image", "9a"):
         with pytest.raises(ValueError, match="topic is"):

@@ -19,6 +19,7 @@ import firenet_jax as fj
 from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.commands import jobs, reconstruct
 from firenet_jax.commands.reconstruct import Reconstruct, describe, plan, run
+from firenet_jax.commands.times import Times
 from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pictures import Display
@@ -704,6 +705,27 @@ def test_a_short_recording_is_a_video_and_the_closing_line_says_how(tmp_path, we
     assert f"; plays {factor:g}" in said and "times slower" in said
     with av.open(str(tmp_path / "a.mp4")) as container:
         assert 15 <= len(list(container.decode(video=0))) <= 21
+
+
+@pytest.mark.parametrize("names", ["number", "nanoseconds"])
+def test_times_that_an_output_cannot_express_end_that_one_alone(tmp_path, weights, names):
+    """Before 0: neither ROS nor names of pictures have them."""
+    if names == "number":
+        pytest.importorskip("rosbags")
+    early, usual = (write_recording(tmp_path / name) for name in ("early.txt", "usual.txt"))
+    head, *rows = early.read_text().splitlines()
+    shifted = (f"{float(t) - 0.5:.6f} {rest}" for t, rest in (row.split(" ", 1) for row in rows))
+    early.write_text("\n".join([head, *shifted]) + "\n")
+    output = tmp_path / ("out.bag" if names == "number" else "out")
+    choice = settings(
+        weights, (early, usual), output, names=names, batch=2,
+        times=Times(rate=None if names == "number" else 20.0),
+    )  # fmt: skip
+    with pytest.raises(RecordingError, match=r"early.*; the other recordings are done"):
+        run(choice)
+    ending = ".bag" if names == "number" else ""
+    assert (tmp_path / "out" / f"usual{ending}").exists()
+    assert not (tmp_path / "out" / f"early{ending}").exists()
 
 
 def test_real_time_is_the_default_and_each_event_is_counted_once(tmp_path, weights, capsys):

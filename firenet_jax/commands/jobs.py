@@ -112,6 +112,7 @@ class Running:
     written: int = 0  # pictures, by this run
     counts: Counts | None = None  # of times at which images are wanted
     error: RecordingError | None = None  # that ended its steps before their time
+    refused: RecordingError | None = None  # by the writer, for a time that it cannot express
 
     def counting(self, chunks: Iterator[Events]) -> Iterator[Events]:
         for chunk in chunks:
@@ -402,12 +403,19 @@ def write(part: Part, shown: np.ndarray, screen: Screen | None) -> int:
     """A part's pictures; returns how many. Where their state was kept, a run can go on from it."""
     running, count = part.running, 0
     for image, at, events in zip(shown, part.times, part.counts, strict=False):
-        if at is not None:
+        if at is None or running.refused:
+            continue
+        try:
             running.writer.write(image, at, events)
-            count += 1
-            if screen:
-                screen.show(image, str(running.job.output))
+        except RecordingError as error:  # the others of the batch go on
+            running.refused = error
+            continue
+        count += 1
+        if screen:
+            screen.show(image, str(running.job.output))
     running.written += count
+    if running.refused:
+        return count
     if isinstance(running.writer, FolderWriter) and not part.ends:
         running.writer.flush()
         resume.publish_position(running.job.output, part.reached)
@@ -417,8 +425,8 @@ def write(part: Part, shown: np.ndarray, screen: Screen | None) -> int:
 def finish(running: Running, way: Way, outcome: Outcome) -> None:
     """Its last pictures are written: the output gets its name, unless the recording failed."""
     output, writer = running.job.output, running.writer
-    if running.error:
-        outcome.failed[output] = running.error
+    if error := running.refused or running.error:
+        outcome.failed[output] = error
         writer.abandon()
         return
     resume.done_file(output).unlink(missing_ok=True)

@@ -26,7 +26,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from firenet_jax.errors import RecordingError
+from firenet_jax.errors import RecordingError, logger
 from firenet_jax.events import Events, Recording
 from firenet_jax.windows import MAX_GAP
 
@@ -195,8 +195,7 @@ class _Binary:
         whole = len(data) // size * size
         rows = np.frombuffer(data[:whole], self.kind)
         if "on" in (self.kind.names or ()):
-            # A time that int64 cannot hold is nonsense, and left out as one before all others.
-            t = np.where(rows["t"] < 2**62, rows["t"], 0).astype(np.int64)
+            t = _possible(rows["t"])
             y, on = rows["y"], rows["on"] != 0
         else:
             y, on, t = rows["y_on"] >> 1, rows["y_on"] & 1 == 1, rows["t"].astype(np.int64)
@@ -211,30 +210,60 @@ class _Binary:
 
 
 class _Text:
-    """Remembers that times are in seconds: of a stream's pieces some may hold whole ones alone."""
+    """Remembers that times are in seconds: of a stream's pieces some may hold whole ones alone.
+
+    A stream may begin within a line, and a part of it may get lost: a broken line, and another one
+    in each thousand, are left out."""
 
     def __init__(self):
-        self.seconds = False
+        self.seconds, self.whole, self.broken = False, 0, 0
 
     def __call__(self, data: bytes) -> tuple[Events, bytes]:
         lines, _, rest = data.rpartition(b"\n")
         rows = [line.split() for line in lines.splitlines()]
         rows = [row for row in rows if len(row) not in (0, 2) and not row[0].startswith(b"#")]
+        if rows and _numbers(rows) is None:
+            rows = self._without_broken(rows)
+        self.whole += len(rows)
         if not rows:
             return NO_EVENTS, rest
-        try:
-            self.seconds |= any(b"." in row[0] or b"e" in row[0].lower() for row in rows)
-            t, x, y, p = np.array(rows, np.float64).T
-            t = np.rint(1e6 * t if self.seconds else t)
-            if not (np.abs(t) < 2**53).all() or not (np.abs([x, y]) < 2**15).all():
-                raise ValueError("numbers too large")
-        except ValueError as error:
-            shown = b" ".join(rows[0])[:60].decode(errors="replace")
+        self.seconds |= any(b"." in row[0] or b"e" in row[0].lower() for row in rows)
+        t, x, y, p = cast(np.ndarray, _numbers(rows)).T
+        t = np.rint(1e6 * t if self.seconds else t)
+        t = _possible(t)
+        return Events(t, x.astype(np.int16), y.astype(np.int16), p > 0), rest
+
+    def _without_broken(self, rows: list[list[bytes]]) -> list[list[bytes]]:
+        """Raises RecordingError for more broken lines than a stream of events has."""
+        kept = [row for row in rows if _numbers([row]) is not None]
+        self.broken += len(rows) - len(kept)
+        whole = self.whole + len(kept)
+        first = next(row for row in rows if _numbers([row]) is None)
+        shown = b" ".join(first)[:60].decode(errors="replace")
+        if not whole or self.broken > 1 + whole // 1000:
             raise RecordingError(
-                f"the stream holds {shown!r} where lines of t x y p were expected ({error}): is "
-                f"--wire right? It may be {', '.join(BINARY)}"
-            ) from error
-        return Events(t.astype(np.int64), x.astype(np.int16), y.astype(np.int16), p > 0), rest
+                f"the stream holds {shown!r} where lines of t x y p were expected: is --wire "
+                f"right? It may be {', '.join(BINARY)}"
+            )
+        logger.warning("the stream holds %r where a line of t x y p was expected: left out", shown)
+        return kept
+
+
+def _numbers(rows: list[list[bytes]]) -> np.ndarray | None:
+    """Lines -> (N, 4) float64; None where one of them is no event."""
+    try:
+        numbers = np.array(rows, np.float64)
+    except ValueError:
+        return None
+    if numbers.shape[1:] != (4,):
+        return None
+    t, x, y, _ = np.abs(numbers).T
+    return numbers if (t < 2**53).all() and (np.maximum(x, y) < 2**15).all() else None
+
+
+def _possible(t: np.ndarray) -> np.ndarray:
+    """int64; a time that this cannot hold is nonsense, and left out as one before all others."""
+    return np.where(np.abs(t) < 2**62, t, 0).astype(np.int64)
 
 
 # ---- Cameras

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from firenet_jax.errors import OutputError, SettingsError
+from firenet_jax.errors import OutputError, RecordingError, SettingsError
 from firenet_jax.storage.files import lock, locked, partial_name, writing
 
 IMAGE, HEADER, TIME = (
@@ -36,7 +36,8 @@ def check_topic(topic: str) -> None:
 
 class BagWriter:
     """Used as `video.VideoWriter`. Raises OutputError where rosbags is not installed, the bag
-    cannot be written, another run writes it, or a time is before 0, which ROS cannot express."""
+    cannot be written, or another run writes it; RecordingError for a time that ROS cannot express.
+    """
 
     def __init__(self, path: Path, topic: str, frame_id: str):
         self.path, self.partial = path, partial_name(path)
@@ -70,7 +71,7 @@ class BagWriter:
     def write(self, picture: np.ndarray, time: int, events: int = 0) -> None:
         """picture: (H, W) or (H, W, 3) uint8; time: microseconds."""
         if not 0 <= time < 2**31 * 1_000_000:
-            raise OutputError(
+            raise RecordingError(
                 f"{self.path}: a picture is at {time / 1e6:.6f} s, but ROS counts from 0 to "
                 f"{2**31} s: choose another output"
             )

@@ -21,7 +21,7 @@ from av.error import FFmpegError
 from av.filter import Graph
 from PIL import Image
 
-from firenet_jax.errors import OutputError, logger
+from firenet_jax.errors import OutputError, RecordingError, logger
 from firenet_jax.storage import bag
 from firenet_jax.storage.files import locked, open_alone, partial_name, writing
 from firenet_jax.storage.runs import make_folder
@@ -175,11 +175,13 @@ class FolderWriter:
         return f"{1000 * time:019d}" if self.in_nanoseconds else f"frame_{self.count:010d}"
 
     def write(self, picture: np.ndarray, time: int, events: int = 0) -> None:
-        """time: microseconds; events: how many the picture is made of."""
+        """time: microseconds; events: how many the picture is made of.
+
+        Raises RecordingError for a time that makes no name."""
         stamps = self.stamps or self.keep(0)
         name = self._name(time)
         if self.in_nanoseconds and time < 0:
-            raise OutputError(
+            raise RecordingError(
                 f"{self.path}: a picture at {time} us, before 0, cannot be named by its time: "
                 "leave out --names nanoseconds"
             )
