@@ -155,6 +155,19 @@ def test_the_layout_is_that_of_event_cnn_minimal(tmp_path):
         assert facts["duration"] == pytest.approx(facts["tk"] - facts["t0"])
 
 
+def test_an_event_has_the_time_of_a_picture_in_the_same_microsecond(tmp_path):
+    """Programs look for the first event that is not earlier: 1e-6 * 3 is less than 3 / 1e6."""
+    times = np.unique(np.random.default_rng(0).integers(0, 2**40, 300))
+    zeros = np.zeros(len(times))
+    pictures = [Picture(int(t), np.zeros((HEIGHT, WIDTH), np.uint8), None) for t in times]
+    events = Events.of(times, zeros, zeros, zeros)
+    write_sequence(tmp_path / "a.h5", [events], pictures, height=HEIGHT, width=WIDTH)
+    with h5py.File(tmp_path / "a.h5") as file:
+        stamps = [image.attrs["timestamp"] for image in file["images"].values()]
+        assert np.array_equal(stamps, file["events/ts"][:])
+        assert (file.attrs["t0"], file.attrs["tk"]) == (stamps[0], stamps[-1])
+
+
 def test_nothing_is_left_of_a_file_that_fails(tmp_path):
     def events():
         yield random_events(100)

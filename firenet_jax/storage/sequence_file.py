@@ -97,13 +97,13 @@ def _write_pictures(file, pictures: Iterable[Picture], height, width) -> tuple[n
         image = images.create_dataset(
             f"image{number:09d}", data=picture.image, chunks=size, **packed
         )
-        image.attrs.update(timestamp=1e-6 * picture.time, size=size, type="greyscale")
+        image.attrs.update(timestamp=picture.time / 1e6, size=size, type="greyscale")
         times.append(picture.time)
         if picture.flow is not None:
             flow = file.require_group("flow").create_dataset(
                 f"flow{number:09d}", data=picture.flow, chunks=picture.flow.shape, **packed
             )
-            flow.attrs.update(timestamp=1e-6 * picture.time, size=picture.flow.shape)
+            flow.attrs.update(timestamp=picture.time / 1e6, size=picture.flow.shape)
             flows += 1
     return np.array(times, np.int64), flows
 
@@ -134,7 +134,7 @@ def _write_events(file, events: Iterable[Events], times: np.ndarray) -> tuple[in
         first, last = int(part.t[0]) if first is None else first, int(part.t[-1])
     for image, index in zip(file["images"].values(), before, strict=True):
         image.attrs["event_idx"] = index
-    start, end = 1e-6 * (first or 0), 1e-6 * (last or 0)
+    start, end = (first or 0) / 1e6, (last or 0) / 1e6
     facts = {"num_events": count, "num_pos": on, "num_neg": count - on}
     return count, facts | {"t0": start, "tk": end, "duration": end - start}
 
