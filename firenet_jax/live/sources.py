@@ -222,20 +222,22 @@ class _Text:
         lines, _, rest = data.rpartition(b"\n")
         rows = [line.split() for line in lines.splitlines()]
         rows = [row for row in rows if len(row) not in (0, 2) and not row[0].startswith(b"#")]
-        if rows and _numbers(rows) is None:
+        numbers = _numbers(rows)
+        if rows and numbers is None:
             rows = self._without_broken(rows)
-        self.whole += len(rows)
-        if not rows:
+            numbers = _numbers(rows)
+        if numbers is None:
             return NO_EVENTS, rest
+        self.whole += len(rows)
         self.seconds |= any(b"." in row[0] or b"e" in row[0].lower() for row in rows)
-        t, x, y, p = cast(np.ndarray, _numbers(rows)).T
-        t = np.rint(1e6 * t if self.seconds else t)
-        t = _possible(t)
+        t, x, y, p = numbers.T
+        t = _possible(np.rint(1e6 * t if self.seconds else t))
         return Events(t, x.astype(np.int16), y.astype(np.int16), p > 0), rest
 
     def _without_broken(self, rows: list[list[bytes]]) -> list[list[bytes]]:
-        """Raises RecordingError for more broken lines than a stream of events has."""
+        """The first broken line is shown. Raises RecordingError for too many of them."""
         kept = [row for row in rows if _numbers([row]) is not None]
+        shows = not self.broken
         self.broken += len(rows) - len(kept)
         whole = self.whole + len(kept)
         first = next(row for row in rows if _numbers([row]) is None)
@@ -245,12 +247,13 @@ class _Text:
                 f"the stream holds {shown!r} where lines of t x y p were expected: is --wire "
                 f"right? It may be {', '.join(BINARY)}"
             )
-        logger.warning("the stream holds %r where a line of t x y p was expected: left out", shown)
+        if shows:
+            logger.warning("the stream holds %r where t x y p was expected: left out", shown)
         return kept
 
 
 def _numbers(rows: list[list[bytes]]) -> np.ndarray | None:
-    """Lines -> (N, 4) float64; None where one of them is no event."""
+    """Lines -> (N, 4) float64; None where one of them is no event, or there are none."""
     try:
         numbers = np.array(rows, np.float64)
     except ValueError:
