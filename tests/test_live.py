@@ -139,6 +139,8 @@ def test_a_broken_line_of_text_is_left_out_and_said(caplog):
     assert "holds '5 2 3 1 7 3'" in caplog.text and "x1e" not in caplog.text
     with pytest.raises(RecordingError, match="'1 2 3' where lines of t x y p"):
         list(sources.decoded([b"0 2 3 1\n1 2 3\n1 a 3 1\n"], "text"))
+    with pytest.raises(RecordingError, match="'1e10 2 3 1' where lines"):  # in the year 2286
+        list(sources.decoded([b"0.5 2 3 1\n1e10 2 3 1\n"], "text"))
 
 
 @pytest.mark.parametrize("wire", list(sources.BINARY))

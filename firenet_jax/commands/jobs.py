@@ -402,21 +402,19 @@ def _get_slot(session: Session, slot) -> Session:
 def write(part: Part, shown: np.ndarray, screen: Screen | None) -> int:
     """A part's pictures; returns how many. Where their state was kept, a run can go on from it."""
     running, count = part.running, 0
-    for image, at, events in zip(shown, part.times, part.counts, strict=False):
-        if at is None or running.refused:
-            continue
-        try:
-            running.writer.write(image, at, events)
-        except RecordingError as error:  # the others of the batch go on
-            running.refused = error
-            continue
-        count += 1
-        if screen:
-            screen.show(image, str(running.job.output))
-    running.written += count
     if running.refused:
-        return count
-    if isinstance(running.writer, FolderWriter) and not part.ends:
+        return 0
+    try:
+        for image, at, events in zip(shown, part.times, part.counts, strict=False):
+            if at is not None:
+                running.writer.write(image, at, events)
+                count += 1
+                if screen:
+                    screen.show(image, str(running.job.output))
+    except RecordingError as error:  # the others of the batch go on
+        running.refused = error
+    running.written += count
+    if isinstance(running.writer, FolderWriter) and not (part.ends or running.refused):
         running.writer.flush()
         resume.publish_position(running.job.output, part.reached)
     return count

@@ -195,7 +195,8 @@ class _Binary:
         whole = len(data) // size * size
         rows = np.frombuffer(data[:whole], self.kind)
         if "on" in (self.kind.names or ()):
-            t = _possible(rows["t"])
+            # A time that int64 cannot hold is nonsense, and left out as one before all others.
+            t = np.where(rows["t"] < 2**62, rows["t"], 0).astype(np.int64)
             y, on = rows["y"], rows["on"] != 0
         else:
             y, on, t = rows["y_on"] >> 1, rows["y_on"] & 1 == 1, rows["t"].astype(np.int64)
@@ -231,25 +232,31 @@ class _Text:
         self.whole += len(rows)
         self.seconds |= any(b"." in row[0] or b"e" in row[0].lower() for row in rows)
         t, x, y, p = numbers.T
-        t = _possible(np.rint(1e6 * t if self.seconds else t))
-        return Events(t, x.astype(np.int16), y.astype(np.int16), p > 0), rest
+        t = np.rint(1e6 * t if self.seconds else t)
+        if not (np.abs(t) < 2**53).all():
+            raise _refused(rows[int(np.argmax(np.abs(t)))])
+        return Events(t.astype(np.int64), x.astype(np.int16), y.astype(np.int16), p > 0), rest
 
     def _without_broken(self, rows: list[list[bytes]]) -> list[list[bytes]]:
         """The first broken line is shown. Raises RecordingError for too many of them."""
-        kept = [row for row in rows if _numbers([row]) is not None]
-        shows = not self.broken
-        self.broken += len(rows) - len(kept)
+        kept, broken = [], []
+        for row in rows:
+            (broken if _numbers([row]) is None else kept).append(row)
         whole = self.whole + len(kept)
-        first = next(row for row in rows if _numbers([row]) is None)
-        shown = b" ".join(first)[:60].decode(errors="replace")
-        if not whole or self.broken > 1 + whole // 1000:
-            raise RecordingError(
-                f"the stream holds {shown!r} where lines of t x y p were expected: is --wire "
-                f"right? It may be {', '.join(BINARY)}"
-            )
-        if shows:
-            logger.warning("the stream holds %r where t x y p was expected: left out", shown)
+        if not whole or self.broken + len(broken) > 1 + whole // 1000:
+            raise _refused(broken[0])
+        if not self.broken:
+            logger.warning("a broken line is left out: %s", _refused(broken[0]))
+        self.broken += len(broken)
         return kept
+
+
+def _refused(row: list[bytes]) -> RecordingError:
+    shown = b" ".join(row)[:60].decode(errors="replace")
+    return RecordingError(
+        f"the stream holds {shown!r} where lines of t x y p were expected: is --wire right? It "
+        f"may be {', '.join(BINARY)}"
+    )
 
 
 def _numbers(rows: list[list[bytes]]) -> np.ndarray | None:
@@ -262,11 +269,6 @@ def _numbers(rows: list[list[bytes]]) -> np.ndarray | None:
         return None
     t, x, y, _ = np.abs(numbers).T
     return numbers if (t < 2**53).all() and (np.maximum(x, y) < 2**15).all() else None
-
-
-def _possible(t: np.ndarray) -> np.ndarray:
-    """int64; a time that this cannot hold is nonsense, and left out as one before all others."""
-    return np.where(np.abs(t) < 2**62, t, 0).astype(np.int64)
 
 
 # ---- Cameras
