@@ -55,7 +55,8 @@ Built in is RUN/weights.npz, a mean of the last weights of stages (Wortsman et a
 ICML 2022); several stages began from such a mean. What was averaged was chosen by the sequences of
 shipped_weights.py and endurance.py. Up to "rests" shot noise drew its signs; in "noise" it moved
 the reference of L, so that it mostly alternated; since then it alternates. Up to "dense" what stops
-for good had no noise of its own (`curricula.AT_REST`).
+for good had no noise of its own (`curricula.AT_REST`). Up to "faint" soft equalisation compared a
+pixel with 36 others, in which differences below 0.1 did not count in full.
 
 The report is written to results/train_default.json, the curve to results/train_default.png. Stages
 that are not in RUN, because they ran elsewhere, keep what was reported of them; of "dusk" to

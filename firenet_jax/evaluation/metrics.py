@@ -229,17 +229,20 @@ def ms_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     return product
 
 
-RANKED = 6  # rows and columns of the pixels with which every pixel is compared
+RANKED = 12  # rows and columns of the pixels with which every pixel is compared
+FAINT = 0.05  # a pixel that is brighter by half of this is brighter for sure
+TONES = np.linspace(-0.1, 1.1, 97, dtype=np.float32)  # beyond, as the first and the last
 
 
 @_measure
 def equalised_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     """SSIM after a soft histogram equalisation of both images, -1 to 1; sees a negative.
 
-    A pixel becomes the share of the image that is darker than it: the mean over 6x6 evenly spaced
-    pixels q of sigmoid((I - I_q) / 0.03). Monotonic changes of brightness hardly matter, and
-    texture down to a contrast of about 0.03 counts as much as strong texture. It is a global,
-    differentiable version of what papers measure when they equalise (`equalise`) before SSIM.
+    A pixel becomes the share of the image that is darker than it: the mean over 12x12 evenly spaced
+    pixels q of (I - I_q) / 0.05 + 1/2, clipped to 0 to 1. Monotonic changes of brightness hardly
+    matter, and texture down to a contrast of about 0.03 counts as much as strong texture. It is a
+    global, differentiable version of what papers measure when they equalise (`equalise`) before
+    SSIM.
     """
     return ssim(_equalised(image), _equalised(truth))
 
@@ -251,11 +254,25 @@ def equalised_mse(image: jax.Array, truth: jax.Array) -> jax.Array:
 
 
 def _equalised(image: jax.Array) -> jax.Array:
+    """The shares of 97 tones are looked up and interpolated: with its gradient on a CPU four times
+    as fast as to compare each pixel with all others."""
     rows, columns = (
         ((np.arange(RANKED) + 0.5) * side / RANKED).astype(int) for side in image.shape[-2:]
     )
-    others = image[..., rows[:, None], columns].reshape(*image.shape[:-2], 1, 1, RANKED**2)
-    return jax.nn.sigmoid((image[..., None] - others) / 0.03).mean(-1)
+    others = image[..., rows[:, None], columns].reshape(-1, 1, RANKED**2)
+    shares = jnp.clip((TONES[None, :, None] - others) / FAINT + 0.5, 0, 1).mean(-1)
+    rises = jnp.pad(jnp.diff(shares), ((0, 0), (0, 1)))
+
+    count, (first, last) = len(TONES), TONES[[0, -1]]
+    place = (image.reshape(len(others), -1) - first) * ((count - 1) / (last - first))
+    place = jnp.clip(place, 0, count - 1)
+    below = jnp.floor(place)
+    index = below.astype(jnp.int32) + count * np.arange(len(others), dtype=np.int32)[:, None]
+
+    def at_index(table):
+        return table.ravel().at[index].get(mode="promise_in_bounds")
+
+    return (at_index(shares) + (place - below) * at_index(rises)).reshape(image.shape)
 
 
 def _power(base: jax.Array, exponent: float) -> jax.Array:
