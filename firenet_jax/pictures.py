@@ -27,6 +27,9 @@ HISTORY = 11  # images whose ranges have a median, which is the range shown
 # is left between them and black and white; its least width, so that noise is not blown up; how
 # many pixels, on a grid, it is read from.
 BEYOND, MARGIN, NARROWEST, SAMPLES = 0.005, 0.05, 0.35, 4096
+# Of what makes a range as wide as that, the part below: where nothing has been seen the ground is
+# light grey, as most grounds are, and hardly changes when something enters that is darker.
+BELOW = 2 / 3
 BORDER = 2  # pixels, which the unsharp mask brightens, as there is nothing beyond them
 
 Range = Literal["auto", "extremes", "fixed"]
@@ -146,7 +149,8 @@ def automatic_range(images: jax.Array) -> tuple[jax.Array, jax.Array]:
     """(..., H, W) -> what becomes black and white in each, (...,) both.
 
     Half a percent of the pixels may lie beyond either end, so that a hot pixel does not take the
-    range; a twentieth of the range is added at both ends; it is never narrower than `NARROWEST`.
+    range; a twentieth of the range is added at both ends; if it is then narrower than `NARROWEST`,
+    two thirds of what is missing are added below and one above.
     """
     height, width = images.shape[-2:]
     if min(height, width) > 4 * BORDER:
@@ -154,9 +158,9 @@ def automatic_range(images: jax.Array) -> tuple[jax.Array, jax.Array]:
     step = max(1, math.isqrt(height * width // SAMPLES))
     sampled = images[..., ::step, ::step].reshape(*images.shape[:-2], -1)
     low, high = jnp.quantile(sampled, jnp.array([BEYOND, 1 - BEYOND]), axis=-1)
-    half = jnp.maximum((0.5 + MARGIN) * (high - low), NARROWEST / 2)
-    middle = (low + high) / 2
-    return middle - half, middle + half
+    margin = MARGIN * (high - low)
+    missing = jnp.maximum(NARROWEST - (high - low + 2 * margin), 0)
+    return low - margin - BELOW * missing, high + margin + (1 - BELOW) * missing
 
 
 def _to_8_bit(images: jax.Array, sigma: float) -> jax.Array:

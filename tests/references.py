@@ -78,7 +78,7 @@ def automatic_ranges(images):
         low, high = np.interp([0.005, 0.995], places, values)
         low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
         missing = max(0.0, 0.35 - (high - low))
-        bounds.append((low - missing / 2, high + missing / 2))
+        bounds.append((low - 2 * missing / 3, high + missing / 3))
         result.append(tuple(np.median(np.array(bounds), axis=0)))
     return result
 

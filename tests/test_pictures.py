@@ -63,7 +63,7 @@ def test_the_range_is_read_from_some_4096_pixels_on_a_grid(height, width, apart)
     y, x = np.mgrid[:height, :width] - 2
     bright = (y % apart == 0) & (x % apart == 0)
     low, high = automatic_range(jnp.where(bright, 1.0, 0.0))
-    assert (float(low) + float(high)) / 2 == pytest.approx(1)
+    assert (float(low) + 2 * float(high)) / 3 == pytest.approx(1)  # more is added below
     assert float(high) - float(low) == pytest.approx(0.35)  # never narrower
     if apart == 1:
         bright = (y % 2 == 0) & (x % 2 == 0)
@@ -109,7 +109,17 @@ def test_automatic_range_does_not_see_hot_pixels_and_does_not_blow_up_noise():
     noise = 0.5 + 0.01 * rng.normal(size=(1, 1, 90, 120)).astype(np.float32)
     shown = np.asarray(display(state, noise, settings=settings)[1], float)
     assert shown.std() == pytest.approx(255 * 0.01 / 0.35, rel=0.05)
-    assert shown.mean() == pytest.approx(127.5, abs=1)
+    assert shown.mean() == pytest.approx(255 * 0.64, abs=1)
+
+
+def test_the_ground_hardly_changes_when_something_dark_enters_where_nothing_was():
+    """Only the entering object is dark: with the range of an empty scene around its middle, the
+    ground jumped from mid-grey to white."""
+    images = np.full((24, 1, 60, 80), 0.55, np.float32)
+    images[12:, :, 20:40, 30:50] = 0.1
+    shown = np.asarray(display(initial_display_state(1), images)[1][:, 0, 5, 5], float)
+    assert shown[0] == pytest.approx(170, abs=1)  # light grey
+    assert np.abs(shown[-1] - shown[0]) < 75
 
 
 def test_automatic_range_of_a_large_image_is_read_from_a_part_of_it():
