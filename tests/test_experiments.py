@@ -8,12 +8,16 @@ import shlex
 import shutil
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 from processes import FEW_OPTIMISATIONS, run_forked
 from test_pipeline import write_recording
 from test_snippets import write_with_frames
 
 import firenet_jax as fj
+from firenet_jax.simulation.scenes import SceneSettings
+from firenet_jax.training.settings import Train
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 WEIGHTS = Path(fj.__file__).parent / "weights" / "firenet.npz"
@@ -51,7 +55,7 @@ SMALL = {
     "voxelisation": "--events 10000 --runs 1 --repeats 1",
     "xla_vs_pytorch": "--quick --parts pipeline",
 }
-SHARED = {"figures", "harness", "pytorch_firenet"}  # no scripts: what others import
+SHARED = {"at_rest", "figures", "harness", "pytorch_firenet"}  # no scripts: what others import
 # "browser" needs one: test_web_page.py uses its parts where there is one.
 ELSEWHERE = {"browser", "model_card"}
 
@@ -128,6 +132,30 @@ def test_tables_of_the_model_card_hold_what_was_measured(monkeypatch):
     assert card.filled(text, *results) == text
     results[1]["rest"][0]["correlation 50"] += 0.02
     assert card.filled(text, *results) != text
+
+
+def test_noise_of_rests_is_balanced_and_as_much_as_it_says(monkeypatch):
+    monkeypatch.syspath_prepend(EXPERIMENTS)
+    at_rest = importlib.import_module("at_rest")
+    noise = np.asarray(at_rest.balanced(jax.random.key(0), (10, 8, 60, 60, 5)))
+    events = np.abs(noise).sum(-1).mean((0, 2, 3))
+    np.testing.assert_allclose(events, at_rest.NOISES, rtol=0.1)
+    assert np.abs(noise.sum(-1).mean((0, 2, 3))).max() < 0.01
+
+
+@pytest.mark.slow
+def test_a_stage_at_rest_trains_what_has_a_memory_and_nothing_else(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(EXPERIMENTS)
+    at_rest = importlib.import_module("at_rest")
+    settings = Train(
+        tmp_path, textures=2, crop=16, batch=8, windows=11, scene=SceneSettings(objects=0)
+    )
+    made = at_rest.keep_at_rest(WEIGHTS, settings, tmp_path / "made.npz", steps=2, rate=1e-3)
+    before, after = fj.load_weights(WEIGHTS).params, fj.load_weights(made).params
+    for name in before:
+        pairs = zip(*map(jax.tree.leaves, (before[name], after[name])), strict=True)
+        apart = max(float(np.abs(a - b).max()) for a, b in pairs)
+        assert (0 < apart < 0.01) if name in at_rest.FREE else apart == 0
 
 
 @pytest.mark.slow
