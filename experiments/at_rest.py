@@ -45,7 +45,10 @@ class Seen(NamedTuple):
 
 
 def keep_at_rest(path: Path, settings: Train, made: Path, steps: int, rate: float) -> Path:
-    """Trains the weights at `path` on sequences of these settings; writes them to `made`."""
+    """Trains the weights at `path` on sequences of these settings; writes them to `made`.
+
+    settings.batch is the number of `NOISES`, as each place of a batch rests in one of them.
+    """
     weights = load_weights(path)
     step_settings = settings.step_settings
     size = settings.crop, settings.crop
