@@ -962,7 +962,8 @@ def test_raw(tmp_path, version):
     [
         ("format EVT21;endianness=legacy;height=480;width=640", True),  # of IMX636
         ("format EVT21;height=480;width=640\n% endianness legacy", True),
-        ("evt 2.1\n% geometry 640x480", True),
+        ("evt 2.1\n% geometry 640x480", True),  # does not say
+        ("evt 2.1\n% geometry 640x480", False),
         ("format EVT21;endianness=little;height=480;width=640", False),  # of GenX320
         ("endianness little\n% format EVT21;height=480;width=640", False),
     ],

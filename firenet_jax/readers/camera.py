@@ -105,8 +105,9 @@ def _raw_header(path: Path) -> tuple[str, tuple[int, int] | None, int, str, int]
     left = (path.stat().st_size - start) % WORD[version[1]]
     known = "2.1" if WORD[version[1]] == 8 else version[1][0]
     name = f"Prophesee raw (EVT{known})"
-    if known == "2.1" and evt21.is_legacy(header):
-        known = "2.1 legacy"
+    if known == "2.1":
+        some = next(_words(path, start, EVT21, CHUNK), np.zeros(0, EVT21))
+        known = "2.1 legacy" if evt21.is_legacy(header, some) else known
     return name, header_size(header), left, known, start
 
 

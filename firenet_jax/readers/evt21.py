@@ -3,7 +3,7 @@
 One half is a word of EVT2 (evt2.py), whose x is that of the first pixel. Of an event the other half
 says which pixels it is of: bit i, that at x + i. Which half comes first depends on the sensor, and
 headers say it as `endianness`: the word of EVT2 in files of Gen4.1, IMX636 and IMX646 ("legacy"),
-the pixels in those of later ones ("little").
+the pixels in those of later ones ("little"). Where a header says nothing, the words do.
 """
 
 import re
@@ -12,10 +12,16 @@ import numpy as np
 
 from firenet_jax.readers import evt2, evt3
 
+KINDS = (0x0, 0x1, 0x8, 0xA, 0xE, 0xF)  # of words of EVT2
 
-def is_legacy(header: str) -> bool:
-    """As is a file that does not say: it is older than the later sensors."""
-    return re.search(r"endianness[ =]little", header) is None
+
+def is_legacy(header: str, words: np.ndarray) -> bool:
+    """What the header says; else whether more of the first halves of (N,) uint64 than of the second
+    are words of EVT2, which all are in one and few in the other."""
+    if said := re.search(r"endianness[ =](legacy|little)", header):
+        return said[1] == "legacy"
+    first, second = (np.isin(half >> 28, KINDS).sum() for half in _halves(True, words))
+    return bool(first >= second)
 
 
 def decode(
