@@ -41,7 +41,7 @@ from firenet_jax.storage.files import check_no_pipe, check_readable, forbidden
 # In the order in which they are asked.
 FORMATS = (
     "ecd", "npy", "rosbag", "hdf5", "text", "ncaltech", "dat", "aedat4", "aedat3", "aedat2",
-    "camera",
+    "raw", "es",
 )  # fmt: skip
 
 CHUNK = 1 << 18  # events a reader yields at once: 3 MB as Events

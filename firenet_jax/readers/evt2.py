@@ -1,29 +1,41 @@
 """EVT2 words -> events, edges at trigger inputs: Prophesee's plain stream, 32 bits each.
 
 bits 31-28   bits 27-0
-0x0, 0x1  event      low time (bits 27-22), x (21-11), y (10-0); read here where faery ends
+0x0, 0x1  event      low time (bits 27-22), x (21-11), y (10-0)
 0x8  time high       bits 33-6 of the time, microseconds, which wraps around after 4.8 hours
 0xA  trigger         low time (bits 27-22), input (12-8), edge (bit 0): 1 rises
 others               vendor's data
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
-from firenet_jax.readers import unwrap
+from firenet_jax.readers import evt3, unwrap
 
 
-def decode(high: int, words: np.ndarray) -> tuple[int, tuple[np.ndarray, ...]]:
-    """As `triggers`, of the events: the time high after them, (t, x, y, p) int64."""
-    high, t, kind, load = _timed(high, words, 0x0, 0x1)
-    return high, (t, load >> 11 & 0x7FF, load & 0x7FF, kind)
+class State(NamedTuple):
+    """What a piece leaves to the next one; -1: not known yet."""
+
+    high: int = -1  # the last time high, unwrapped
+    latest: int = -1  # the largest time of all events
 
 
-def triggers(high: int, words: np.ndarray) -> tuple[int, tuple[np.ndarray, ...]]:
-    """The time high so far, -1 where it is not known yet, (N,) uint32 -> the time high after them,
-    (times, ids, polarity), int64: microseconds, input, 0 or 1. Edges before the first time high are
-    left out."""
-    high, t, _, load = _timed(high, words, 0xA)
-    return high, (t, load >> 8 & 0x1F, load & 1)
+def decode(state: State, words: np.ndarray) -> tuple[State, tuple[np.ndarray, ...]]:
+    """(N,) uint32 -> state after them, (t, x, y, p) int64: microseconds, column, row, 0 or 1.
+
+    Events before the first time high are left out: their place in time is unknown.
+    """
+    high, t, kind, load = _timed(state.high, words, 0x0, 0x1)
+    latest, t = evt3.without_jitter(state.latest, t)
+    return State(high, latest), (t, load >> 11 & 0x7FF, load & 0x7FF, kind)
+
+
+def triggers(state: State, words: np.ndarray) -> tuple[State, tuple[np.ndarray, ...]]:
+    """(N,) uint32 -> state after them, of which only time high counts, (times, ids, polarity)
+    int64: microseconds, input, 0 or 1. Edges before the first time high are left out."""
+    high, t, _, load = _timed(state.high, words, 0xA)
+    return state._replace(high=high), (t, load >> 8 & 0x1F, load & 1)
 
 
 def _timed(high: int, words: np.ndarray, *kinds: int):

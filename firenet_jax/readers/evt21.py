@@ -10,7 +10,7 @@ import re
 
 import numpy as np
 
-from firenet_jax.readers import evt2, evt3
+from firenet_jax.readers import evt2
 
 KINDS = (0x0, 0x1, 0x8, 0xA, 0xE, 0xF)  # of words of EVT2
 
@@ -25,23 +25,23 @@ def is_legacy(header: str, words: np.ndarray) -> bool:
 
 
 def decode(
-    legacy: bool, state: tuple[int, int], words: np.ndarray
-) -> tuple[tuple[int, int], tuple[np.ndarray, ...]]:
-    """As `evt2.decode`, of (N,) uint64. state: that of `evt2`, and the latest time."""
-    high, latest = state
+    legacy: bool, state: evt2.State, words: np.ndarray
+) -> tuple[evt2.State, tuple[np.ndarray, ...]]:
+    """As `evt2.decode`, of (N,) uint64."""
     heads, pixels = _halves(legacy, words)
-    high, columns = evt2.decode(high, heads)
+    state, columns = evt2.decode(state, heads)
     pixels = pixels[heads >> 28 < 2]
     pixels = pixels[len(pixels) - len(columns[0]) :]  # without those before the first time high
     event, bit = np.nonzero(pixels[:, None] >> np.arange(32, dtype=np.uint32) & 1)
     t, x, y, p = (column[event] for column in columns)
-    latest, t = evt3.without_jitter(latest, t)
-    return (high, latest), (t, x + bit, y, p)
+    return state, (t, x + bit, y, p)
 
 
-def triggers(legacy: bool, high: int, words: np.ndarray) -> tuple[int, tuple[np.ndarray, ...]]:
+def triggers(
+    legacy: bool, state: evt2.State, words: np.ndarray
+) -> tuple[evt2.State, tuple[np.ndarray, ...]]:
     """As `evt2.triggers`, of (N,) uint64."""
-    return evt2.triggers(high, _halves(legacy, words)[0])
+    return evt2.triggers(state, _halves(legacy, words)[0])
 
 
 def _halves(legacy: bool, words: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
