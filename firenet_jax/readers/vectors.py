@@ -9,8 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-LOAD = 12  # bits
-
 
 class Base(NamedTuple):
     """Where the next vector's bit 0 lies (-1: not known yet), and its polarity."""
@@ -35,12 +33,17 @@ def expand(
     moved -= np.append(0, moved[sets])[latest]  # since the base was set, this word included
 
     words = np.flatnonzero(known & (single | (width > 0) & (starts[latest] >= 0)))
-    # A single event is a vector with one bit, at its own place.
-    single, latest, width = single[words], latest[words], width[words]
-    first = np.where(single, load[words] & 0x7FF, starts[latest] + moved[words] - width)
-    on = np.where(single, load[words] >> 11, polarities[latest])
-    bits = np.where(single, 1, load[words] & (1 << width) - 1)
-    word, bit = np.nonzero(bits[:, None] >> np.arange(LOAD) & 1)
+    load, single, latest, width = load[words], single[words], latest[words], width[words]
+    vector = np.flatnonzero(~single)
+    first, on, count = load & 0x7FF, load >> 11, np.ones(words.shape, int)
+    first[vector] = (starts[latest] + moved[words] - width)[vector]
+    on[vector] = polarities[latest[vector]]
+    mask = (load[vector] & (1 << width[vector]) - 1).astype("<u2")
+    bits = np.unpackbits(mask.view(np.uint8), bitorder="little")
+    count[vector] = bits.reshape(-1, 16).sum(1)
+    word = np.repeat(np.arange(len(words)), count)
+    bit = np.zeros(word.shape, int)
+    bit[~single[word]] = np.flatnonzero(bits) & 15
 
     place = starts[-1] + (moved[-1] if load.size and starts[-1] >= 0 else 0)
     return Base(int(place), int(polarities[-1])), (words[word], first[word] + bit, on[word])
