@@ -457,6 +457,23 @@ def test_ecd_without_frames(tmp_path, caplog):
     assert open_recording(folder, (3, 4)).frames is None
 
 
+def test_ecd_zip_without_its_pictures(tmp_path, caplog):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        for name, content in ecd_files().items():
+            if not name.endswith(".png"):
+                archive.writestr(name, content)
+    assert open_recording(tmp_path / "a.zip", (3, 4)).frames is None
+    assert "images/a.png, which is not there" in caplog.text
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.int32])
+def test_ecd_pictures_of_16_bits(tmp_path, kind):
+    folder = ecd_folder(tmp_path)
+    deep = FRAME.astype(np.uint16) << 8 | 0x5A
+    Image.fromarray(deep.astype(kind)).save(folder / "images/a.png")
+    np.testing.assert_array_equal(open_recording(folder).frames.read(0), FRAME)
+
+
 def test_wrong_ecd(tmp_path):
     folder = ecd_folder(tmp_path)
     write(folder / "events.txt", "0.1 1 2 1\n0.05 1 2 1\n")

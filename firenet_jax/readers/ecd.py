@@ -10,6 +10,7 @@ The files name no sensor size: it is that of the first frame, and unknown where 
 
 import io
 import math
+import os
 from dataclasses import replace
 from pathlib import Path, PurePath
 
@@ -94,17 +95,23 @@ def _frames(path: Path) -> Frames | None:
         names.append(name)
     if not names:
         return None
-    try:
-        _bytes(path, names[0])
-    except (OSError, KeyError):
+    if not _holds(path, names[0]):
         logger.warning("%s: images.txt names %s, which is not there: no frames", path, names[0])
         return None
     return Frames(microseconds(np.array(times)), lambda i: _frame(path, names[i]))
 
 
+def _holds(path: Path, name: str) -> bool:
+    if path.is_dir():
+        return os.path.isfile(path / name)
+    return f"{_folder_in(path)}{name}" in text.members(path)
+
+
 def _frame(path: Path, name: str) -> np.ndarray:
-    # KeyError: not in the zip; OSError: not in the folder, or not a picture
+    # OSError: not in the folder, or not a picture
     bomb = Image.DecompressionBombError
-    with reading(path / name, OSError, KeyError, SyntaxError, bomb):
+    with reading(path / name, OSError, SyntaxError, bomb):
         with Image.open(io.BytesIO(_bytes(path, name))) as picture:
+            if picture.mode.startswith("I"):  # 16 bits, which conversion would cut off at 255
+                return to_frame(np.asarray(picture).astype(np.uint16), path)
             return to_frame(np.asarray(picture.convert("L")), path)
