@@ -466,11 +466,9 @@ def test_ecd_zip_without_its_pictures(tmp_path, caplog):
     assert "images/a.png, which is not there" in caplog.text
 
 
-@pytest.mark.parametrize("kind", [np.uint16, np.int32])
-def test_ecd_pictures_of_16_bits(tmp_path, kind):
+def test_ecd_pictures_of_16_bits(tmp_path):
     folder = ecd_folder(tmp_path)
-    deep = FRAME.astype(np.uint16) << 8 | 0x5A
-    Image.fromarray(deep.astype(kind)).save(folder / "images/a.png")
+    Image.fromarray(FRAME.astype(np.uint16) << 8 | 0x5A).save(folder / "images/a.png")
     np.testing.assert_array_equal(open_recording(folder).frames.read(0), FRAME)
 
 
@@ -1246,6 +1244,23 @@ def test_mono_packets_are_rounded_to_the_nearest_microsecond(new_bag):
     bag.packet(EPOCH, np.array(words, "<u8").tobytes(), "mono")
     bag.close()
     check(path, EPOCH + np.array([0, 1, 3]), [0, 1, 2], [0] * 3, [0] * 3, size=None)
+
+
+@pytest.mark.parametrize("pause", [1, 6, 12, 16.7, 18, 40])  # seconds
+def test_a_pause_longer_than_a_turn_of_the_sensors_clock(new_bag, pause):
+    path, bag = new_bag("pause")
+    times = np.arange(0, 500_000, 10_000)
+    times = np.append(times, times + times[-1] + int(pause * 1e6))
+    for t in times.tolist():
+        clock = high(t >> 12 & 0xFFF), low(t & 0xFFF)
+        if t % 3 == 1:  # a message that tells no event
+            bag.packet(EPOCH + t, np.array(clock, "<u2").tobytes())
+        words = *clock, row(3), single(7, 1), 0xA201
+        bag.packet(EPOCH + t, np.array(words, "<u2").tobytes())
+    bag.close()
+    recording = open_recording(path)
+    assert (concatenate([*recording.events()]).t - EPOCH).tolist() == times.tolist()
+    assert (recording.triggers().times - EPOCH).tolist() == times.tolist()
 
 
 def test_colour_frames_of_bags(new_bag, caplog):

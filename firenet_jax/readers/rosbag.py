@@ -21,7 +21,7 @@ import contextlib
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import chain
+from itertools import chain, takewhile
 from os.path import commonprefix
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -48,6 +48,7 @@ ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
 IMAGE = "sensor_msgs/msg/Image"
 WORDS = 1 << 18  # words of 16 bits decoded at once: messages are tiny
+PAUSE = 5_000_000  # microseconds between two messages: EVT3's clock may have wrapped around
 # Readers of files whose index is missing or damaged.
 TORN = {".bag": torn_bag.Torn, ".mcap": torn_mcap.Torn}
 ORDERS: dict[str, Literal["little", "big"]] = {"<": "little", ">": "big"}
@@ -294,12 +295,35 @@ def _mono(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, .
         yield packet.stamp, (t, words >> 32 & 0xFFFF, words >> 48 & 0x7FFF, words >> 63)
 
 
-def _evt3(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, ...]]]:
-    def decode(state: evt3.State, some: list[_Packet]):
-        payload = b"".join(packet.payload for packet in some)
-        return evt3.decode(state, np.frombuffer(payload, some[-1].words + "u2"))
+class _Evt3:
+    """Words of packets -> columns. After a pause that the stamps tell, as where a recorder was
+    stopped, it makes up for the turns of the sensor's clock in between: 16.8 s, 24 bits, each."""
 
-    return _many_at_once(packets, evt3.State(), decode)
+    def __init__(self, decode: Callable = evt3.decode):
+        self.decode = decode
+        self.shift: int | None = None  # microseconds from the sensor's clock to that of the stamps
+        self.last = 0  # stamp
+        self.ahead = evt3.State()  # of events, up to the first
+
+    def __call__(self, state: evt3.State, some: list[_Packet]):
+        payload = b"".join(packet.payload for packet in some)
+        words = np.frombuffer(payload, some[-1].words + "u2").astype(np.uint16)
+        if self.shift is None:
+            self.ahead, (t, *_) = evt3.decode(self.ahead, words)
+            self.shift = some[-1].stamp - int(t[0]) if len(t) else None
+        elif some[0].stamp - self.last > PAUSE:
+            t = evt3.decode(state._replace(y=0), words)[1][0]  # of any row
+            if not len(t):  # the next ones will tell
+                return self.decode(state, words)
+            turns = round((some[0].stamp - self.shift - int(t[0])) / (1 << 24))
+            high, time = state.high + (turns << 12), state.time + (turns << 24)
+            state = state._replace(high=high, time=time)
+        self.last = some[-1].stamp
+        return self.decode(state, words)
+
+
+def _evt3(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, ...]]]:
+    return _many_at_once(packets, evt3.State(), _Evt3())
 
 
 def _libcaer_cmp(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, ...]]]:
@@ -313,25 +337,35 @@ def _libcaer_cmp(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.nda
 
 
 def _many_at_once(
-    packets: Iterator[_Packet], state: Any, decode: Callable
+    packets: Iterator[_Packet],
+    state: Any,
+    decode: Callable,
+    begun: Callable = lambda columns: len(columns[0]) > 0,
 ) -> Iterator[tuple[int, tuple[np.ndarray, ...]]]:
-    """Message by message up to the first event, whose stamp counts; then many at once.
+    """Message by message up to the first event, whose stamp counts; then many at once, none of them
+    after a pause.
 
-    decode: (state, packets) -> (state after them, columns)"""
-    waiting, size, started, damage = [], 0, False, None
+    decode: (state, packets) -> (state after them, columns). begun: of columns, whether the first
+    event has come."""
+    waiting, size, started, damage, last = [], 0, False, None, 0
     try:
         for packet in packets:
+            if waiting and packet.stamp - last > PAUSE:
+                state, columns = decode(state, waiting)
+                waiting, size = [], 0
+                yield last, columns
             waiting.append(packet)
+            last = packet.stamp
             size += len(packet.payload)
             if started and size < 2 * WORDS:
                 continue
             state, columns = decode(state, waiting)
-            waiting, size, started = [], 0, started or len(columns[0]) > 0
-            yield packet.stamp, columns
+            waiting, size, started = [], 0, started or begun(columns)
+            yield last, columns
     except Exception as error:  # damage, of any kind: raised below, after what precedes it
         damage = error
     if waiting:
-        yield 0, decode(state, waiting)[1]
+        yield last, decode(state, waiting)[1]
     if damage is not None:
         raise damage
 
@@ -354,24 +388,15 @@ DECODERS = {"evt3": _evt3, "libcaer": _libcaer, "libcaer_cmp": _libcaer_cmp, "mo
 
 def _triggers(path: Path, topic: str) -> Iterator[tuple[np.ndarray, ...]]:
     """Edges among the words of EVT3, moved to the ROS clock as the events are."""
-    state, ahead, shift, waiting, found = evt3.State(), evt3.State(), None, bytearray(), []
+    clock, found = _Evt3(evt3.triggers), []
     with contextlib.suppress(Exception), _bag(path) as bag:  # events raise it
-        for _, raw in _raw(bag, topic):
-            packet = _packet(_Message(raw, not _is_ros1(path)))
-            if packet.encoding != "evt3":
-                break
-            words = np.frombuffer(packet.payload, packet.words + "u2").astype(np.uint16)
-            if shift is None:
-                state, columns = evt3.decode(state, words)
-                shift = packet.stamp - int(columns[0][0]) if len(columns[0]) else None
-            waiting += words.tobytes()
-            if len(waiting) >= 2 * WORDS:
-                ahead, edges = evt3.triggers(ahead, np.frombuffer(bytes(waiting), np.uint16))
-                waiting = bytearray()
-                found.append(edges)
-    found.append(evt3.triggers(ahead, np.frombuffer(bytes(waiting), np.uint16))[1])
-    if shift is not None:
-        yield from ((times + shift, ids, rises) for times, ids, rises in found)
+        ros2 = not _is_ros1(path)
+        packets = (_packet(_Message(raw, ros2)) for _, raw in _raw(bag, topic))
+        packets = takewhile(lambda packet: packet.encoding == "evt3", packets)
+        edges = _many_at_once(packets, evt3.State(), clock, lambda _: clock.shift is not None)
+        found.extend(columns for _, columns in edges)
+    if clock.shift is not None:
+        yield from ((times + clock.shift, ids, rises) for times, ids, rises in found)
 
 
 def _frames(path: Path, bag, topic: str | None) -> Frames | None:
