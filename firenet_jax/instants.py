@@ -35,7 +35,7 @@ from firenet_jax.events import Events, Recording, concatenate, with_damage
 from firenet_jax.windows import MAX_GAP, Window, Windows, cut
 
 WARM_UP = 20  # windows
-MOST_WARMING = 8.0  # events per pixel, slightly more than twenty usual windows
+MOST_WARMING = 0.4  # events per pixel and window, slightly more than in usual windows
 MAX_RATE = 1_000_000  # images per second: times are whole microseconds
 
 
@@ -111,16 +111,17 @@ def warming(
     """Windows -> (the first `count` of them as steps, forwards and then backwards in time; all
     windows again).
 
-    Fewer, but one, if they hold more than 8 events per pixel: they are kept in memory. An error of
-    the windows is raised where it was.
+    Fewer, but one, if they hold more than 0.4 events per pixel on the mean (of twenty, where fewer
+    are wanted): they are kept in memory. An error of the windows is raised where it was.
     """
     cutter = iter(cutter)
     seen: deque[Window] = deque()
     damage = None
+    most = MOST_WARMING * max(count, WARM_UP) * pixels
     try:
         for window in itertools.islice(cutter, count):
             seen.append(window)
-            if sum(len(window.events) for window in seen) > MOST_WARMING * pixels:
+            if sum(len(window.events) for window in seen) > most:
                 break
     except RecordingError as error:
         damage = error

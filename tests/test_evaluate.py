@@ -16,6 +16,7 @@ import h5py
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 from skimage.metrics import structural_similarity
 
 import firenet_jax
@@ -315,6 +316,22 @@ def test_damaged_pictures_of_an_earlier_run_are_named(folder, tmp_path):
     path.unlink()
     run(ours)
     assert path.is_file()  # computed again
+
+
+def test_damage_after_the_last_frame_does_not_keep_the_report_from_being_written(tmp_path):
+    """Nothing that is measured or shown lies there."""
+    folder = tmp_path / "data" / "cut"
+    (folder / "images").mkdir(parents=True)
+    rows, lines = events_of(4000, 8 * PERIOD), []
+    rows = zip(rows.t, rows.x, rows.y, rows.p, strict=True)
+    text = "".join(f"{t / 1e6:.6f} {x} {y} {int(p)}\n" for t, x, y, p in rows)
+    (folder / "events.txt").write_text(text + f"{8 * PERIOD / 1e6} 3")
+    for n in range(6):
+        Image.fromarray(moving_pattern(n)).save(folder / "images" / f"{n}.png")
+        lines.append(f"{n * PERIOD / 1e6:.6f} images/{n}.png\n")
+    (folder / "images.txt").write_text("".join(lines))
+    run(Evaluate(output=tmp_path / "out", data=(tmp_path / "data",), methods="hf"))
+    assert "cut" in (tmp_path / "out" / "index.html").read_text()
 
 
 def test_other_settings_are_refused_by_name_and_replaced_when_told(folder, tmp_path):

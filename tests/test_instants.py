@@ -288,6 +288,19 @@ def test_images_after_the_warm_up_are_those_of_a_state_that_has_seen_the_beginni
     np.testing.assert_allclose(images[:-1], np.stack(wanted)[clear][:-1], atol=2e-5)
 
 
+@pytest.mark.parametrize(
+    "per_pixel, asked, used",
+    [(0.35, 20, 20), (0.35, 40, 40), (1.0, 20, 9), (1.0, 40, 17), (9, 4, 1)],
+)
+def test_a_warm_up_keeps_as_many_windows_as_are_asked_for_unless_they_are_dense(
+    per_pixel, asked, used
+):
+    events = Events.of(*np.zeros((4, int(100 * per_pixel)), int))
+    first, again = warming((Window(events, k) for k in range(50)), 100, asked)
+    assert len(first) == 2 * used
+    assert [window.time for window in again] == list(range(50))
+
+
 def test_recordings_side_by_side_and_steps_that_are_not_there(weights):
     """Three recordings of 6, 4 and 0 steps, of which some look, against each alone."""
     rng = np.random.default_rng(1)

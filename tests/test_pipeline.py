@@ -741,6 +741,11 @@ def test_real_time_is_the_default_and_each_event_is_counted_once(tmp_path, weigh
                      **choice))  # fmt: skip
         line = capsys.readouterr().out
         assert said in line and "of 3,000 events" in line and "Mev/s" not in line
+    # Gone in 0.4 s: slower, however it is cut.
+    for windows in (Windows(), Windows(duration=5), Windows(events=50)):
+        run(settings(weights, (recording,), tmp_path / "a.mp4", windows=windows, overwrite=True,
+                     stop=0.1))  # fmt: skip
+        assert "plays 8" in capsys.readouterr().out
     with pytest.raises(ValueError, match="fps and speed"):
         settings(weights, (recording,), tmp_path / "a.mp4", fps=5.0, speed=1.0)
     for name, choice, said in (

@@ -31,7 +31,7 @@ from firenet_jax.evaluation import lpips, report
 from firenet_jax.evaluation.comparison import Gap, Plan, matched, to_8_bit
 from firenet_jax.evaluation.equalise import Kind, equalise
 from firenet_jax.evaluation.methods import METHODS, Method, Missing, digest, load
-from firenet_jax.evaluation.protocol import Protocol, evaluate, plan, steps_of
+from firenet_jax.evaluation.protocol import Protocol, evaluate, plan, steps_of, until
 from firenet_jax.evaluation.results import METRICS, Measured, mean, summary
 from firenet_jax.events import Recording
 from firenet_jax.readers import FORMATS, aedat, open_recording
@@ -454,7 +454,8 @@ def events_before(plan: Plan, settings: Evaluate, numbers: set[int]) -> dict[int
     recording, found, left = plan.recording, {}, set(numbers)
     if not left:  # where no method had an image, reading may raise why
         return found
-    windows = ((e.time, e.events) for e in steps_of(plan) if e.time is not None)
+    latest = int(plan.times[plan.last - 1]) + settings.protocol.tolerated
+    windows = ((e.time, e.events) for e in until(latest, steps_of(plan)) if e.time is not None)
     for place, events in matched(windows, plan.times, settings.protocol.tolerated):
         if not left:
             break
