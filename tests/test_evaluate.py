@@ -25,7 +25,7 @@ from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.commands import evaluate, options
 from firenet_jax.commands.evaluate import Evaluate, run
 from firenet_jax.commands.times import Times
-from firenet_jax.errors import RecordingError
+from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.evaluation import comparison, methods, metrics, protocol
 from firenet_jax.evaluation.baselines import e2vid
 from firenet_jax.evaluation.baselines.high_pass import HighPass
@@ -88,7 +88,9 @@ def folder(tmp_path_factory):
 
 
 def settings(folder, output, **changes):
-    standard = {"data": (folder / "data",), "e2vid_random": True}
+    standard = {"data": (folder / "data",)}
+    if "e2vid" in changes.get("methods", "e2vid"):
+        standard["e2vid_random"] = True
     if "firenet" in changes.get("methods", "firenet"):
         standard["weights"] = (folder / "ours.npz",)
     return Evaluate(output=output, **(standard | changes))
@@ -316,6 +318,13 @@ def test_damaged_pictures_of_an_earlier_run_are_named(folder, tmp_path):
     path.unlink()
     run(ours)
     assert path.is_file()  # computed again
+
+
+def test_options_of_e2vid_without_it_are_refused(folder, tmp_path):
+    for name in ("e2vid_random", "e2vid_sigmoid"):
+        choice = {name: not getattr(Evaluate, name), "methods": "hf"}
+        with pytest.raises(SettingsError, match=f"{name.replace('_', '-')}: no part in an eval"):
+            settings(folder, tmp_path / "out", **choice)
 
 
 def test_damage_after_the_last_frame_does_not_keep_the_report_from_being_written(tmp_path):

@@ -525,6 +525,8 @@ def test_a_recording_played(tmp_path, monkeypatch, capsys):
         ("missing.bin --sensor-size 20x12", "no such file, and no source"),
         ("a.txt --replay --speed 0", "speed is 0.0"),
         ("a.txt --replay --speed inf", "speed is inf"),
+        ("a.txt --replay --seconds -1", "seconds is -1.0"),
+        ("a.txt --replay --seconds nan", "seconds is nan"),
         ("a.txt --replay --longest 0.0004", "longest"),
         ("a.txt --replay --longest inf", "longest"),
         ("a.txt --replay --port 70000", "ports are 0 to 65535"),

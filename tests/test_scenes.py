@@ -416,6 +416,7 @@ def test_video_gives_each_time_its_picture(scenes):
         ({"zoom": (1.0, 0.5)}, "the least first"), ({"pause": 1.5}, "a probability"),
         ({"shake": -0.1}, "a probability"), ({"shake_pixels": (0.0, 1.0)}, "shake_pixels is 0 1"),
         ({"blur": (0.0, 0.5)}, "more than 0"),
+        ({"shake_pixels": (1.0, 2.0)}, "--shake-pixels says more of --shake"),
         ({"objects": -1}, "objects is -1"), ({"tilt": -0.1}, "tilt"),
         ({"white": (0.9, 2.0)}, "white is 0.9 2"),
     ],

@@ -13,7 +13,7 @@ from firenet_jax.events import Events, concatenate
 from firenet_jax.network import initial_state
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.simulation import sensor as module
-from firenet_jax.simulation.curricula import random_setups, sequences, window_bounds
+from firenet_jax.simulation.curricula import _uneven, random_setups, sequences, window_bounds
 from firenet_jax.simulation.scenes import SceneSettings, rendering_times, speeds, video
 from firenet_jax.simulation.sensor import (
     EPS,
@@ -25,6 +25,7 @@ from firenet_jax.simulation.sensor import (
     SensorSettings,
     check_idle,
     event_list,
+    first_state,
     random_sensor,
     simulate,
     to_and_fro,
@@ -360,6 +361,24 @@ def test_sensors_at_the_edge_of_what_can_be(choice):
 def test_sensors_beyond_the_edge(choice, message):
     with pytest.raises(ValueError, match=message):
         SensorSettings(**choice)
+
+
+@pytest.mark.parametrize("change", ["clean", "uneven"])
+def test_mid_recording_begins_within_whatever_thresholds_a_sensor_ends_up_with(change):
+    """Of a still scene there is no event, also where thresholds are replaced later."""
+    clean = 1.0 if change == "clean" else 0.0
+    drawn = SensorSettings(
+        threshold_range=(0.5, 0.6), mismatch=0.03, mid_recording=True, clean=clean
+    )
+    sensor = random_sensor(jax.random.key(0), height=30, width=40, settings=drawn)
+    if change == "uneven":
+        batch = jax.tree.map(lambda leaf: leaf[None], sensor)
+        uneven = _uneven(batch, jnp.zeros(1), jnp.ones(1, bool), 1.0)
+        sensor = jax.tree.map(lambda leaf: leaf[0], uneven)
+    seen = first_state(sensor, jnp.full((30, 40), 0.5))
+    on, off = (np.broadcast_to(each, (30, 40)) for each in (sensor.on, sensor.off))
+    assert (seen.above <= on).all() and (seen.above >= -off).all()
+    assert 0.2 < ((seen.above + off) / (on + off)).std() < 0.35  # uniform: 0.29
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from firenet_jax.events import Events
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.simulation.curricula import window_bounds
 from firenet_jax.simulation.scenes import SceneSettings
-from firenet_jax.simulation.sensor import FAULTY, Simulation, simulate
+from firenet_jax.simulation.sensor import FAULTY, SensorSettings, Simulation, simulate
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage.files import locked
 from firenet_jax.storage.sequence_file import Picture, write_sequence
@@ -556,6 +556,7 @@ def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypa
         ({"data": (Path("a"),), "images": Path("b"), "scene": SceneSettings(shake=0.5)},
          "^images, shake: no part in training on sequences from --data"),
         ({"augment": Augment(hot_pixels=0)}, "^hot-pixels: no part in training on simulated"),
+        ({"sensor": SensorSettings(cutoff_dark=0.5)}, "--cutoff-dark says more of --cutoff"),
         ({"seed": -3}, "seed is -3"), ({"seed": 5_000_000_000}, "less than 2"),
     ],
 )  # fmt: skip

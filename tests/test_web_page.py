@@ -16,6 +16,7 @@ from test_cli import firenet
 from test_pipeline import write_recording
 
 from firenet_jax.commands.export import Export, run, simulated
+from firenet_jax.errors import SettingsError
 from firenet_jax.events import Events, concatenate
 from firenet_jax.export.web_page import FILES
 from firenet_jax.readers import open_recording
@@ -198,6 +199,8 @@ def test_a_page_without_its_runtime_says_what_to_install(tmp_path, capsys, monke
     monkeypatch.chdir(tmp_path)
     code, _, error = firenet(capsys, "export --web page")
     assert code == 1 and "npm install onnxruntime-web" in error and error.count("\n") == 1
+    with pytest.raises(SettingsError, match="runtime, sample: no part in an export without --web"):
+        Export(output=Path("a.onnx"), runtime=tmp_path, sample=tmp_path)
     assert not list(tmp_path.iterdir())
     runtime = tmp_path / "node_modules" / "onnxruntime-web"
     runtime.mkdir(parents=True)

@@ -35,7 +35,7 @@ from firenet_jax.evaluation.protocol import Protocol, evaluate, plan, steps_of, 
 from firenet_jax.evaluation.results import METRICS, Measured, mean, summary
 from firenet_jax.events import Recording
 from firenet_jax.readers import FORMATS, aedat, open_recording
-from firenet_jax.settings import parse_size
+from firenet_jax.settings import check_none_idle, parse_size
 from firenet_jax.storage.files import identity, named, read_arrays, write_arrays, write_text
 from firenet_jax.storage.progress import bar
 from firenet_jax.storage.runs import alone_in, check_same, differences, make_folder, read_record
@@ -116,6 +116,10 @@ class Evaluate:
             )
         if not self.method_names:
             raise SettingsError(f"no methods: choose from {', '.join(METHODS)}")
+        if "e2vid" not in self.method_names:
+            names = "e2vid_weights", "e2vid_random", "e2vid_sigmoid"
+            idle = [name for name in names if getattr(self, name) != getattr(Evaluate, name)]
+            check_none_idle(idle, "an evaluation without e2vid")
         parse_size(self.sensor_size)
         _ = self.protocol  # refuses what cannot be
 

@@ -18,6 +18,7 @@ from firenet_jax.export.stablehlo import stablehlo
 from firenet_jax.export.tensors_file import pth, safetensors
 from firenet_jax.export.web_page import RUNTIME, runtime_version, write_page
 from firenet_jax.readers import open_recording
+from firenet_jax.settings import check_none_idle
 from firenet_jax.simulation.scenes import rendering_times, video
 from firenet_jax.simulation.sensor import event_list
 from firenet_jax.storage.files import OutputError, partial_name, writing
@@ -58,6 +59,11 @@ class Export:
     """--web: recording that the page starts with (its first seconds). Default: a simulated one."""
     overwrite: bool = False
     """Replace an existing output."""
+
+    def __post_init__(self):
+        if self.web is None:
+            names = [n for n in ("runtime", "sample") if getattr(self, n) != getattr(Export, n)]
+            check_none_idle(names, "an export without --web")
 
 
 SAMPLE = 500_000  # events: some seconds, one or two megabytes

@@ -76,7 +76,7 @@ class Live:
     display: Display = Display()
 
     def __post_init__(self):
-        check_sizes(self, "speed", "repeat", "behind")
+        check_sizes(self, "speed", "repeat", "behind", "seconds")
         if not 0 <= self.port < 2**16:
             raise SettingsError(f"port is {self.port}, but ports are 0 to 65535")
         Windows(events_per_pixel=self.events_per_pixel, longest=self.longest)  # checks them

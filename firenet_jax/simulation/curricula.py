@@ -85,7 +85,8 @@ def random_setups(
     times the mismatch, and in most of them a fiftieth of the noise and leaks.
     swift: share of the sequences with very fast motion (`SWIFT` pixels per window, more than one
     between renderings) over a plain background.
-    Where the sensor has noise, half of the scenes that stop for good are noisy (`AT_REST`).
+    Where the settings have noise, half of the scenes that stop for good are noisy (`AT_REST`), of
+    clean sensors too: at rest an image is to stay whatever comes.
     Raises SettingsError if `motion` is more than a pixel between two renderings (`check_motion`),
     or if slow and swift are not valid shares.
     """

@@ -86,6 +86,10 @@ class SceneSettings:
                 raise SettingsError(
                     f"{name} is {getattr(self, name)}, but is a probability, 0 to 1"
                 )
+        if self.shake_pixels != SceneSettings.shake_pixels and not self.shake:
+            raise SettingsError(
+                "--shake-pixels says more of --shake, which is not asked for: pass that, too"
+            )
         if self.objects < 0:
             raise SettingsError(f"objects is {self.objects}, but must be 0 or more")
         if not 0 <= self.tilt <= 1:

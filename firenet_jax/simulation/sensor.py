@@ -103,7 +103,8 @@ class SensorSettings:
     """Sinusoidal flicker of a lamp or screen at 60 to 240 Hz: its amplitude relative to the mean
     intensity, greatest at a random point of the image. Not set by --faults."""
     clean: float = 0.0
-    """Share of the sequences with the paper's thresholds and none of these faults."""
+    """Share of the sequences with the paper's thresholds and none of these faults (but after a stop
+    for good, --halt, half of them have noise, too)."""
     mid_recording: bool = False
     """Start in the middle of a recording: each pixel's reference is anywhere within a threshold of
     the first rendering, instead of equal to it."""
@@ -197,7 +198,9 @@ class Sensor(NamedTuple):
     cutoff: jax.Array | None  # (2,) hertz in full light; factor in the dark
     phase: jax.Array | None  # (H, W) share of the first threshold already crossed where L drifts,
     # and whether noise starts with ON; otherwise all pixels would start with the same event
-    start: jax.Array | None  # (H, W) L above the reference at the first rendering
+    start: (
+        jax.Array | None
+    )  # (H, W) where L is at the first rendering: 0 at OFF's threshold, 1 at ON's
     lamp: Lamp | None
     key: jax.Array  # of the noise
 
@@ -259,7 +262,7 @@ def random_sensor(
             drift = jnp.where(chance < share, rate, drift)
     start = None
     if settings.mid_recording:
-        start = jax.random.uniform(jax.random.fold_in(key, 1), shape, minval=-off, maxval=on)
+        start = jax.random.uniform(jax.random.fold_in(key, 1), shape)
     if settings.refractory_range is not None:
         refractory = log_uniform(settings.refractory_range, next(numbers))
     else:
@@ -330,7 +333,7 @@ def first_state(sensor: Sensor, image: jax.Array) -> SensorState:
         drifted = jnp.where(sensor.drift > 0, sensor.on, -sensor.off) * sensor.phase
         above = jnp.where(sensor.drift != 0, drifted, above)
     if sensor.start is not None:
-        above = sensor.start
+        above = sensor.start * (sensor.on + sensor.off) - sensor.off
     silent = None if sensor.refractory is None else jnp.zeros(image.shape, jnp.int32)
     # From a lower bit of the phase, independent of when a pixel leaks.
     noise_on = None

@@ -16,7 +16,7 @@ from firenet_jax.errors import SettingsError
 from firenet_jax.settings import check_none_idle, check_range, check_seed, check_share, check_sizes
 from firenet_jax.simulation.curricula import LONGEST_WINDOW, check_motion, check_rare
 from firenet_jax.simulation.scenes import SceneSettings
-from firenet_jax.simulation.sensor import FAULTY, SensorSettings
+from firenet_jax.simulation.sensor import FAULTY, SensorSettings, check_idle
 from firenet_jax.training.batches import Augment, is_set
 from firenet_jax.training.losses import DISTANCES, Loss
 from firenet_jax.training.step import StepSettings
@@ -140,6 +140,8 @@ class Train:
                 f"crop is {self.crop} pixels, but images smaller than {MIN_CROP} cannot be judged"
             )
         _check_idle(self)
+        if not self.data:
+            check_idle(self.sensor)
         check_range("motion", self.motion)
         _check_step(self)
         check_rare(self.slow, self.swift)
