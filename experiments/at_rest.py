@@ -110,10 +110,10 @@ def keep_at_rest(path: Path, settings: Train, made: Path, steps: int, rate: floa
     return made
 
 
-def balanced(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Event tensors (T, B, H, W, 5) of noise, ON as often as OFF, as much as `NOISES` says."""
+def balanced(key: jax.Array, shape: tuple[int, ...], noises: np.ndarray = NOISES) -> jax.Array:
+    """Event tensors (T, B, H, W, 5) of noise, ON as often as OFF, so many events per pixel."""
     fired_key, sign_key = jax.random.split(key)
-    fired = jax.random.uniform(fired_key, shape) < NOISES[None, :, None, None, None] / shape[-1]
+    fired = jax.random.uniform(fired_key, shape) < noises[None, :, None, None, None] / shape[-1]
     signs = jnp.where(jax.random.bernoulli(sign_key, shape=shape), 1.0, -1.0)
     return jnp.where(fired, signs, 0.0)
 

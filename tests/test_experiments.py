@@ -17,6 +17,7 @@ from test_snippets import write_with_frames
 
 import firenet_jax as fj
 from firenet_jax.simulation.scenes import SceneSettings
+from firenet_jax.training.losses import Loss
 from firenet_jax.training.settings import Train
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
@@ -55,7 +56,13 @@ SMALL = {
     "voxelisation": "--events 10000 --runs 1 --repeats 1",
     "xla_vs_pytorch": "--quick --parts pipeline",
 }
-SHARED = {"at_rest", "figures", "harness", "pytorch_firenet"}  # no scripts: what others import
+SHARED = {
+    "at_rest",
+    "figures",
+    "harness",
+    "holding",
+    "pytorch_firenet",
+}  # no scripts: what others import
 # "browser" needs one: test_web_page.py uses its parts where there is one.
 ELSEWHERE = {"browser", "model_card"}
 
@@ -156,6 +163,48 @@ def test_a_stage_at_rest_trains_what_has_a_memory_and_nothing_else(tmp_path, mon
         pairs = zip(*map(jax.tree.leaves, (before[name], after[name])), strict=True)
         apart = max(float(np.abs(a - b).max()) for a, b in pairs)
         assert (0 < apart < 0.01) if name in at_rest.FREE else apart == 0
+
+
+@pytest.mark.slow
+def test_a_stage_that_holds_trains_all_parts(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(EXPERIMENTS)
+    holding = importlib.import_module("holding")
+    monkeypatch.setattr(holding, "CUT", 16)
+    settings = Train(
+        tmp_path, textures=4, batch=2, crop=20, windows=2, chain=2, warmup=0,
+        loss=Loss(nlpd=0, haarpsi=0, lambda_tc=0, l0=1),
+        scene=SceneSettings(objects=0), optimiser="centred",
+    )  # fmt: skip
+    made = holding.train_and_hold(WEIGHTS, settings, tmp_path / "made.npz", steps=3)
+    before, after = fj.load_weights(WEIGHTS).params, fj.load_weights(made).params
+    for name in before:
+        pairs = zip(*map(jax.tree.leaves, (before[name], after[name])), strict=True)
+        assert 0 < max(float(np.abs(a - b).max()) for a, b in pairs) < 0.01
+
+
+def test_what_goes_to_and_fro_is_held_to_its_first_round(monkeypatch):
+    """Backward first, as it begins where forward has ended; in two places at two ages."""
+    monkeypatch.syspath_prepend(EXPERIMENTS)
+    holding = importlib.import_module("holding")
+    rng = np.random.default_rng(0)
+    tensors = rng.normal(size=(3, 2, 4, 4, 5)).astype(np.float32)
+    back, forth = rng.random((2, 3, 2, 4, 4)).astype(np.float32)
+    held = holding.nothing_held(3)._replace(
+        tensors=tensors, first=(back, forth), passes=np.array([4, 7])
+    )
+    given, wanted = holding.next_pass(held)
+    np.testing.assert_array_equal(given[:, 1], tensors[:, 1])
+    np.testing.assert_array_equal(wanted[:, 1], forth[:, 1])
+    for t in range(3):
+        for n in range(5):
+            np.testing.assert_array_equal(given[t, 0, ..., n], -tensors[2 - t, 0, ..., 4 - n])
+    np.testing.assert_array_equal(wanted[:, 0], back[:, 0])
+    # a shift of brightness counts four times, a difference that it lacks once; some not at all
+    images = np.zeros((1, 2, 4, 4), np.float32)
+    even, odd = images + 0.1, images + 0.1 * (-1) ** np.arange(4)
+    assert holding.moved(even, images, np.ones(2)) == pytest.approx(0.4)
+    assert holding.moved(odd, images, np.ones(2)) == pytest.approx(0.1)
+    assert holding.moved(even, images, np.array([1, 0])) == pytest.approx(0.2)
 
 
 @pytest.mark.slow
