@@ -153,7 +153,8 @@ def test_a_red_bar_is_red(tmp_path, flip):
     bar = slice(4, -4), slice(count - 9, count - 3)
     before = slice(4, -4), slice(count + 10, -2)  # beyond the halo of the bar
     assert min((red - green)[bar].mean(), (red - blue)[bar].mean()) > 15
-    assert abs((red - blue)[before].mean()) < 15
+    # What has seen nothing has a level of its own in each colour, which depends on the weights.
+    assert abs((red - blue)[before].mean()) < (red - blue)[bar].mean() / 3
 
 
 def test_a_mosaic_has_even_sides():

@@ -263,7 +263,7 @@ def test_the_pages_events_are_those_before_its_frames(folder, evaluated):
 def test_the_command_line_gives_the_settings_again():
     for chosen in (
         Evaluate((Path("a b"), Path("c")), Path("out")),
-        Evaluate((Path("a"),), Path("out"), "hf,mr", (Path("x"), Path("y")), duration=20.5,
+        Evaluate((Path("a"),), Path("out"), "e2vid,mr", (Path("x"), Path("y")), duration=20.5,
                  e2vid_sigmoid=False, equalise="local", overwrite=True),
     ):  # fmt: skip
         words = shlex.split(options.command_line("evaluate", chosen))
