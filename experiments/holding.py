@@ -86,12 +86,12 @@ def next_pass(held: Held) -> tuple[jax.Array, jax.Array]:
 
 @partial(jax.jit, static_argnames="settings", donate_argnames="state")
 def hold_step(
-    state: TrainState, held: Held, source: tuple[jax.Array, jax.Array], number: jax.Array,
+    state: TrainState, held: Held, source: tuple[jax.Array, jax.Array],
     ends: tuple[jax.Array, jax.Array], rate: jax.Array, settings: StepSettings,
 ) -> tuple[TrainState, Held, dict[str, jax.Array]]:  # fmt: skip
     """source: as of `train_step`; ends: (N,) and (M,) bool, what ends with this step; rate: by
     which the update is multiplied."""
-    key, textures = source
+    (key, textures), number = source, state.step
     data, (seen, before), warm = steps_of._simulated(key, textures, settings, state)
     noise_key, cut_key = jax.random.split(jax.random.fold_in(key, number + 10**6))
     size = settings.windows, len(NOISES), CUT, CUT, 5
@@ -162,7 +162,7 @@ def train_and_hold(path: Path, settings: Train, made: Path, steps: int) -> Path:
             rate = min(1, (k + 1) / RAMP) * (0.02 + 0.49 * (1 + np.cos(np.pi * k / steps)))
             ends = tuple(jnp.asarray(each <= 1) for each in left)
             state, held, terms = hold_step(
-                state, held, source, jnp.int32(k), ends, jnp.float32(rate), step_settings
+                state, held, source, ends, jnp.float32(rate), step_settings
             )
             for each in left:
                 each -= 1

@@ -1112,14 +1112,11 @@ LOYAL = replace(
     sensor=replace(FINE.sensor, clean=0.7),
 )
 TRUSTY = replace(
-    FINE,
+    LOYAL,
     steps=1325,
     crop=80,
     batch=4,
-    renderings=40,
     motion=(0.7, 40.0),
-    frozen=(),
-    learning_rate=1e-3,
     seed=912,
     loss=replace(FINE.loss, l1=3.0, equalised_mse=10.0),
     scene=replace(FINE.scene, black=(0.0, 0.15), white=(0.7, 1.0)),

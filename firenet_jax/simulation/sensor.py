@@ -198,9 +198,7 @@ class Sensor(NamedTuple):
     cutoff: jax.Array | None  # (2,) hertz in full light; factor in the dark
     phase: jax.Array | None  # (H, W) share of the first threshold already crossed where L drifts,
     # and whether noise starts with ON; otherwise all pixels would start with the same event
-    start: (
-        jax.Array | None
-    )  # (H, W) where L is at the first rendering: 0 at OFF's threshold, 1 at ON's
+    start: jax.Array | None  # (H, W) first L, from 0 at OFF's threshold to 1 at ON's
     lamp: Lamp | None
     key: jax.Array  # of the noise
 
