@@ -102,6 +102,7 @@ class Frames(NamedTuple):
     read: Callable[[int], np.ndarray]  # i -> (H, W) uint8
     # i -> (2, H, W) optical flow up to this picture, x then y, pixels per second; None: no flow
     flow: Callable[[int], np.ndarray | None] | None = None
+    damage: Exception | None = None  # that hides those after these
 
 
 class Triggers(NamedTuple):

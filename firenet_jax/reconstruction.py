@@ -40,8 +40,8 @@ class Network:
     """How the network runs."""
 
     recurrent: bool = True
-    """Carry the state from window to window; otherwise each window starts from a zero state (the
-    ablation in Fig. 5 of the paper)."""
+    """Whether the state is carried from window to window. With --no-recurrent each window starts
+    from a zero state (the ablation in Fig. 5 of the paper)."""
     bfloat16: bool = False
     """Compute convolutions in bfloat16, slightly less accurate. For accelerators; slower on a
     CPU."""

@@ -1,6 +1,7 @@
 """Methods beside frames: numbers against a direct computation, gaps, resuming, the report."""
 
 import csv
+import dataclasses
 import datetime
 import html
 import importlib
@@ -9,6 +10,7 @@ import re
 import shlex
 import sys
 import zipfile
+from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -327,6 +329,16 @@ def test_options_of_e2vid_without_it_are_refused(folder, tmp_path):
             settings(folder, tmp_path / "out", **choice)
 
 
+def test_options_that_would_do_nothing_are_refused(folder, tmp_path):
+    ours = partial(settings, folder, tmp_path / "out", methods="firenet,e2vid")
+    with pytest.raises(SettingsError, match="seed: no part in an evaluation of all frames"):
+        ours(seed=5)
+    ours(seed=5, keep_ratio=0.5)
+    for choice in ({"e2vid_sigmoid": False}, {"e2vid_weights": tmp_path / "e2vid.pth"}):
+        with pytest.raises(SettingsError, match="no part in an evaluation with random weights"):
+            ours(e2vid_random=True, **choice)
+
+
 def test_damage_after_the_last_frame_does_not_keep_the_report_from_being_written(tmp_path):
     """Nothing that is measured or shown lies there."""
     folder = tmp_path / "data" / "cut"
@@ -505,6 +517,31 @@ def test_intervals_of_the_event_camera_dataset(tmp_path):
         counted(start=7.0, stop=8.0)
 
 
+def test_a_warm_up_begins_between_frames_where_none_lies_before_it(folder, tmp_path):
+    path = write(tmp_path / "late.h5", 6, events_of(30_000, 3_000_000), begin=2_000_000)
+    recording = open_recording(path)
+
+    def begin(**changes):
+        protocol = settings(folder, tmp_path / "out", data=(path,), **changes).protocol
+        found = plan("late", recording, protocol)
+        return found.times[found.first] - found.begin
+
+    first = int(next(iter(recording.events())).t[0])
+    assert begin() == 2_000_000 + PERIOD - first
+    assert begin(warm_up=1.0) == 1_000_000
+    assert begin(warm_up=0.0) == begin(warm_up=1e-6 * PERIOD) == PERIOD
+
+
+def test_frames_that_end_at_damage_are_a_gap(folder, tmp_path):
+    """A mean over those before it would look like that of the recording."""
+    recording = open_recording(folder / "data" / "a.h5")
+    damage = RecordingError("a.h5: cut off")
+    recording = dataclasses.replace(recording, frames=recording.frames._replace(damage=damage))
+    protocol = settings(folder, tmp_path / "out").protocol
+    with pytest.raises(Gap, match="its frames end where it is damaged: a.h5: cut off"):
+        plan("a", recording, protocol)
+
+
 def test_a_silent_camera_leaves_the_frames_that_count_as_they_are(folder, tmp_path):
     """The windows without events at the ends of what is asked for are windows too."""
     events = events_of(24_000, 6 * PERIOD)
@@ -637,7 +674,8 @@ def test_a_recording_that_cannot_be_cut_is_a_gap_beside_the_others(folder, tmp_p
     early = Events.of([0], [1], [1], [1])
     write(data / "pause.h5", 6, concatenate([early, late]), begin=4 * 10**9)
     for _ in range(2):
-        results = run(settings(folder, tmp_path / "out", data=(data,), methods="hf"))
+        choice = {"data": (data,), "methods": "hf", "warm_up": 5000.0}  # with the pause
+        results = run(settings(folder, tmp_path / "out", **choice))
         assert results["sequences"]["data-good"]["methods"]["hf"]["frames"] == 5
         assert "gap" in results["sequences"]["data-pause"]["methods"]["hf"]
         assert (tmp_path / "out/index.html").exists()

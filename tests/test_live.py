@@ -111,6 +111,21 @@ def test_text_in_seconds_stays_so_from_piece_to_piece():
     assert found.t.tolist() == [600_000]
 
 
+@pytest.mark.parametrize("unit", [1, 1e-6])
+def test_text_is_read_alike_with_and_without_a_comment(unit):
+    """Pieces that hold nothing but numbers are parsed at once, others line by line."""
+    rng = np.random.default_rng(0)
+    t = 1_589_163_148_000_000 + np.cumsum(rng.integers(0, 9, 3000))
+    shown = (f"{time * unit:.{0 if unit == 1 else 6}f}" for time in t.tolist())
+    x, y, p = rng.integers(0, 240, 3000), rng.integers(0, 180, 3000), rng.integers(-1, 2, 3000)
+    lines = [f"{a} {b} {c} {d}\n".encode() for a, b, c, d in zip(shown, x, y, p, strict=True)]
+    for between in (b"", b"# t x y p\n"):
+        pieces = [between + b"".join(lines[n : n + 100]) for n in range(0, 3000, 100)]
+        found = concatenate([*sources.decoded(pieces, "text")])
+        for column, wanted in zip("txyp", (t, x, y, p > 0), strict=True):
+            np.testing.assert_array_equal(getattr(found, column), wanted)
+
+
 def test_a_last_line_of_text_may_lack_its_end():
     found = concatenate([*sources.decoded([b"1 2 3 1\n2 ", b"2 3 1"], "text")])
     assert found.t.tolist() == [1, 2]

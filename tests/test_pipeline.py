@@ -1,6 +1,7 @@
 import gzip
 import json
 import os
+import re
 import subprocess
 import sys
 import textwrap
@@ -246,6 +247,17 @@ def test_what_an_interrupted_run_left_is_named_where_it_is_damaged(tmp_path, wei
     kept.unlink()
     run(settings(weights, (recording,), tmp_path / "out"))
     assert len(pictures_of(tmp_path / "out")[0]) == 30
+
+
+def test_a_run_that_goes_on_counts_the_events_of_its_own_pictures(
+    tmp_path, weights, monkeypatch, capsys
+):
+    recording = write_recording(tmp_path / "a.txt")
+    unfinished(weights, recording, tmp_path / "out", monkeypatch)
+    capsys.readouterr()
+    run(settings(weights, (recording,), tmp_path / "out"))
+    said = re.search(r"out: (\d+) pictures of ([\d,]+) events", capsys.readouterr().out)
+    assert 0 < int(said[1]) < 30 and int(said[2].replace(",", "")) == 100 * int(said[1])
 
 
 @pytest.mark.slow

@@ -107,6 +107,17 @@ def test_an_interrupted_run_goes_on_and_gives_the_same(tmp_path, weights, monkey
             assert ours.read_text() == theirs.read_text()
 
 
+def test_a_rate_counts_from_the_first_event_that_is_no_hot_pixels(tmp_path, weights):  # noqa: F811
+    rows = write_recording(tmp_path / "a.txt", 2000).read_text().splitlines()
+    early = f"{float(rows[1].split()[0]) - 0.01:.6f} 3 4 1"
+    (tmp_path / "a.txt").write_text("\n".join([rows[0], early, *rows[1:]]) + "\n")
+    (tmp_path / "hot.txt").write_text("3,4\n")
+    choice = {"times": Times(rate=50), "hot_pixels": str(tmp_path / "hot.txt")}
+    run(settings(weights, (tmp_path / "a.txt",), tmp_path / "out", **choice))
+    first = next(row for row in rows[1:] if row.split()[1:3] != ["3", "4"])
+    assert stamps_of(tmp_path / "out")[0][1] == round(1e6 * float(first.split()[0]))
+
+
 def test_a_video_keeps_the_times(tmp_path, weights):  # noqa: F811
     """A tenth as fast, at times that are not even."""
     recording = write_recording(tmp_path / "a.txt", 800)

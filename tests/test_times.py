@@ -66,6 +66,33 @@ def test_what_was_told_apart_is_said_and_options_decide(tmp_path, recording, cap
     assert found.tolist() == [5_000_000, 6_000_000]
 
 
+@pytest.mark.parametrize(
+    "text, times",
+    [
+        ("0\n100000\n2100000\n", [0, 100_000, 2_100_000]),  # microseconds, one beyond the end
+        ("1\n2\n", [1_000_000, 2_000_000]),  # whole seconds, the last beyond the end
+        ("0\n500\n1000\n1500\n", [0, 500_000, 1_000_000, 1_500_000]),  # whole milliseconds
+        ("0\n33\n67\n100\n133\n", [0, 33_000, 67_000, 100_000, 133_000]),
+        ("33.3\n66.6\n", [33_300, 66_600]),
+        ("33333.0\n66667.0\n", [33_333, 66_667]),
+        ("1.0e+05\n1.2e+06\n", [100_000, 1_200_000]),  # as numpy.savetxt writes them
+        ("5.0e+06\n5.25e+06\n", [0, 250_000]),  # on the sensor's clock
+        ("5000\n5033\n", [0, 33_000]),
+        ("5\n6\n", [0, 1_000_000]),
+    ],
+)
+def test_a_unit_is_that_whose_times_cover_the_recording(tmp_path, recording, text, times):
+    """Of a finer one more times always lie within it, all in its first instant."""
+    assert read(tmp_path, recording, text).tolist() == [5_000_000 + time for time in times]
+
+
+def test_a_time_that_is_there_twice_is_said(tmp_path, recording, caplog):
+    with caplog.at_level(logging.WARNING):
+        found = read(tmp_path, recording, "0.3\n0.1\n0.1\n0.2\n", unit="s", since="start")
+    assert found.tolist() == [5_100_000, 5_200_000, 5_300_000]
+    assert "1 time of before: one image each" in caplog.text
+
+
 def test_times_of_today_keep_their_microseconds(tmp_path):
     first = 1_764_000_000_000_000
     recording = recording_of(first + np.arange(1000))
@@ -82,9 +109,11 @@ def test_times_of_today_keep_their_microseconds(tmp_path):
         ("5.25s\n5500ms\n", "line 2: is in ms, but before it in s"),
         ("5.25\n5500ms\n", "line 2: names a unit, but those before do not"),
         ("5 parsec\n5parsec\n", "holds no times|expected a time"),
-        ("99.5\n", "none of its 1 time lies within the recording, 5.000000 to 6.999000 s"),
+        ("O.5\n1.0\n", "line 1: expected a time, found 'O.5'"),
+        ("00:00:01.5\n00:00:02\n", "line 1: expected a time, found '00:00:01.5'"),
+        ("9999.5\n", "none of its 1 time lies within the recording, 5.000000 to 6.999000 s"),
         ("9" * 400 + "\n", "none of its"),
-        ("nan\n", "holds no times"),
+        ("nan\n", "line 1: expected a time, found 'nan'"),
     ],
 )
 def test_files_that_are_of_no_use(tmp_path, recording, text, said):

@@ -120,8 +120,14 @@ class Evaluate:
             names = "e2vid_weights", "e2vid_random", "e2vid_sigmoid"
             idle = [name for name in names if getattr(self, name) != getattr(Evaluate, name)]
             check_none_idle(idle, "an evaluation without e2vid")
+        elif self.e2vid_random:
+            names = "e2vid_weights", "e2vid_sigmoid"
+            idle = [name for name in names if getattr(self, name) != getattr(Evaluate, name)]
+            check_none_idle(idle, "an evaluation with random weights of e2vid")
         parse_size(self.sensor_size)
         _ = self.protocol  # refuses what cannot be
+        if self.seed != Evaluate.seed and self.keep_ratio == 1:
+            check_none_idle(["seed"], "an evaluation of all frames")
 
     @property
     def method_names(self) -> list[str]:

@@ -109,6 +109,7 @@ class Running:
     reached: int = 0  # steps taken so far, those of an earlier run among them
     pictures: int = 0  # of these
     events: int = 0  # read so far, by this run
+    chunk: Events = field(default_factory=Events.empty)  # the last of them
     written: int = 0  # pictures, by this run
     counts: Counts | None = None  # of times at which images are wanted
     error: RecordingError | None = None  # that ended its steps before their time
@@ -117,7 +118,16 @@ class Running:
     def counting(self, chunks: Iterator[Events]) -> Iterator[Events]:
         for chunk in chunks:
             self.events += len(chunk)
+            self.chunk = chunk
             yield chunk
+
+    def skip(self, count: int) -> None:
+        """Passes over so many steps, whose events do not count."""
+        last = None
+        for step in itertools.islice(self.steps, count):
+            last = int(step.events.t[-1]) if len(step.events) else last
+        if last is not None:  # what has been read is at most a chunk ahead
+            self.events = int((self.chunk.t > last).sum())
 
     def take(self, count: int) -> list[Step]:
         """The next `count` steps, or as many as there are."""
@@ -282,7 +292,8 @@ def start(job: Job, way: Way, opened: dict[Path, Writer]) -> tuple[Running, Sess
             entries = steps(job.recording, job.windows, times, windows, running.counts)
         running.steps, running.warming = itertools.chain(first, entries), len(first)
         running.reached, running.pictures, session = position(job, way)
-        running.ahead = next(itertools.islice(running.steps, running.reached, None), None)
+        running.skip(running.reached)
+        running.ahead = next(running.steps, None)
         if running.ahead is None and not running.reached:
             raise RecordingError(
                 f"{job.recording.path}: no events, or none that the filters let pass"
@@ -295,7 +306,6 @@ def start(job: Job, way: Way, opened: dict[Path, Writer]) -> tuple[Running, Sess
         raise
     if running.reached and isinstance(writer, FolderWriter):
         writer.keep(running.pictures)
-        running.events = 0  # those of the pictures that are there
     return running, session
 
 

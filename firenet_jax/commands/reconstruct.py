@@ -4,9 +4,10 @@
 """
 
 import dataclasses
+import functools
 import hashlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -295,14 +296,19 @@ def job_of(
             f"{path}: says that its sensor sees no colours, --color would invent some: leave it out"
         )
     windows, speed = windows_for(recording, settings)
+    choice = settings.hot_pixels
+    hot = functools.cache(lambda: None if choice is None else hot_pixels(choice, recording))
     try:
-        times = times_of(settings.times, recording, part_of(recording, settings))
+        times = times_of(settings.times, recording, filtered(recording, settings, hot))
     except RecordingError as error:
         outcome.failed[output] = error
         return None
     record = describe(dataclasses.replace(settings, windows=windows), recording, weights, times)
     if is_done(output, record):
-        logger.warning("%s: done by the run that this one continues", output)
+        logger.warning(
+            "%s: done by the run that this one continues (without %s it is made again)",
+            output, done_file(output).name,
+        )  # fmt: skip
         return None
     video.check_output(output, settings.overwrite)
     read_position(output, record, settings.overwrite)  # so that errors come before the work
@@ -312,7 +318,7 @@ def job_of(
         record=record,
         windows=windows,
         times=times,
-        events=lambda: filtered(recording, settings),
+        events=lambda: filtered(recording, settings, hot),
         writer=lambda: writer_of(output, settings, speed),
         warm_up=settings.warm_up if settings.network.recurrent else 0,
     )
@@ -340,13 +346,16 @@ def part_of(recording: Recording, settings: Reconstruct) -> Iterator[Events]:
     return filters.between(recording.events(), settings.start, settings.stop)
 
 
-def filtered(recording: Recording, settings: Reconstruct) -> Iterator[Events]:
+def filtered(
+    recording: Recording, settings: Reconstruct, hot: Callable[[], np.ndarray | None]
+) -> Iterator[Events]:
+    """hot: its hot pixels, which are found when the first event is asked for."""
     chunks = part_of(recording, settings)
-    if settings.hot_pixels is not None:
-        chunks = filters.without(chunks, hot_pixels(settings.hot_pixels, recording))
+    if (pixels := hot()) is not None:
+        chunks = filters.without(chunks, pixels)
     if settings.flip:
         chunks = filters.turned(chunks, recording.height, recording.width)
-    return chunks
+    yield from chunks
 
 
 def hot_pixels(choice: str, recording: Recording) -> np.ndarray:
@@ -418,4 +427,5 @@ def closing_line(done: list[Done], seconds: float, times: Times) -> str:
 def factor_in_words(slower: float) -> str:
     if 0.98 < slower < 1.02:
         return "in real time"
-    return f"{slower:.3g} times slower" if slower > 1 else f"{1 / slower:.3g} times faster"
+    factor, way = (slower, "slower") if slower > 1 else (1 / slower, "faster")
+    return f"{factor:,.0f} times {way}" if factor >= 100 else f"{factor:.3g} times {way}"

@@ -2,8 +2,8 @@
 
 A file of times has one time per line, in its first column or in the one that a header line names
 time, t or timestamp. Unit and origin are given by an option, after a number (`33.3ms`) or in the
-header (`#timestamp [ns]`); otherwise those for which most times lie within the recording are
-taken, and a notice says which.
+header (`#timestamp [ns]`); otherwise those are taken for which most times lie within the recording
+and cover most of it, and a notice says which.
 """
 
 import re
@@ -25,6 +25,7 @@ UNITS = {"s": 10**6, "ms": 10**3, "us": 1, "ns": Decimal("0.001")}  # microsecon
 UNIT_OF = {name: names[0] for names in text.UNITS.values() for name in names}
 UNIT_NAMES = {names[0]: names[-1] for names in text.UNITS.values()}  # "ms": "milliseconds"
 COLUMN = re.compile(r"t|time|timestamps?|stamps?")  # without its unit
+NAME = re.compile(r"(?<![\w.:+-])(?!nan|inf)[a-z_]+(?:[\s,;\[(]|$)")  # in a header line
 NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-zµμ]*)", re.IGNORECASE)
 SPLIT = re.compile(r"[\s,;]+")
 LARGEST = 1 << 28  # bytes of a file of times
@@ -142,22 +143,23 @@ def _from_file(path: Path, wanted: Times, recording: Recording) -> np.ndarray:
     numbers, unit, since_start = read_times(path)
     unit = wanted.unit or unit
     since_start = since_start if wanted.since is None else wanted.since == "start"
-    units = [unit] if unit else ["us", "ns", "s"]
-    if not unit and any("." in number or "e" in number.lower() for number in numbers):
-        units = ["s"]
+    units = [unit] if unit else [*UNITS] if whole_numbers(numbers) else ["s", "ms"]
     origins = [False, True] if since_start is None else [since_start]
     first, last = _span(recording.events(), whole=len(units) * len(origins) > 1)
     if first is None:
         raise RecordingError(f"{recording.path}: holds no events")
 
+    # Of a finer unit more times always lie within the recording: all in its first instant.
     found = []
     for name in units:
         scaled = _scaled(numbers, name)
         for relative in origins:
             times = scaled + first if relative else scaled
-            inside = int(((times >= first) & (times <= last)).sum())
-            found.append((inside, times, name, relative))
-    inside, times, name, relative = max(found, key=lambda one: one[0])  # of equals the first
+            inside = np.unique(times[(times >= first) & (times <= last)])
+            span = np.ptp(inside) if len(inside) > 1 else (inside - first).sum()
+            covered = float(span) / max(last - first, 1)
+            found.append((inside.size / times.size * covered, inside.size, times, name, relative))
+    _, inside, times, name, relative = max(found, key=lambda one: one[:2])  # of equals the first
     if len(units) * len(origins) > 1:
         if not inside:
             raise RecordingError(
@@ -170,7 +172,20 @@ def _from_file(path: Path, wanted: Times, recording: Recording) -> np.ndarray:
             path, counted(len(times), "time"), UNIT_NAMES[name],
             "since the first event" if relative else "on the recording's clock",
         )  # fmt: skip
-    return np.unique(times)
+    if again := len(times) - len(once := np.unique(times)):
+        logger.warning("%s: %s of before: one image each", path, counted(again, "time"))
+    return once
+
+
+def whole_numbers(numbers: list[str]) -> bool:
+    """Whether none has a fraction: 33333, 33333.0 and 1.0e+06 have none."""
+
+    def whole(number: str) -> bool:
+        digits, _, exponent = number.lower().partition("e")
+        fraction = digits.partition(".")[2].rstrip("0")
+        return len(fraction) <= int(exponent or 0)
+
+    return all(map(whole, numbers))
 
 
 def read_times(path: Path) -> tuple[list[str], str | None, bool | None]:
@@ -191,7 +206,7 @@ def read_times(path: Path) -> tuple[list[str], str | None, bool | None]:
             continue
         fields = SPLIT.split(line)
         found = NUMBER.fullmatch(fields[column]) if column < len(fields) else None
-        if not numbers and (line.startswith("#") or found is None):
+        if not numbers and (line.startswith("#") or found is None and NAME.search(line.lower())):
             column, unit, since_start = _header(line, column, unit, since_start)
             continue
         if line.startswith("#"):

@@ -138,6 +138,8 @@ def plan(name: str, recording: Recording, protocol: Protocol) -> Plan:
     frames = recording.frames
     if frames is None or len(frames.times) < 2:
         raise Gap("no frames")
+    if frames.damage is not None:  # those after it would be left out of the means
+        raise Gap(f"its frames end where it is damaged: {frames.damage}")
     height, width = frames.read(0).shape
     if (height, width) != (recording.height, recording.width):
         raise Gap(
@@ -163,10 +165,10 @@ def plan(name: str, recording: Recording, protocol: Protocol) -> Plan:
     if not counting.size:
         raise Gap(f"no frames from {start:g} to {stop:g} s")
     first, last = int(counting[0]), int(counting[-1]) + 1
-    # Reconstruction begins at a frame, so that windows between frames are whole.
-    warm = np.searchsorted(times, origin + round(1e6 * (start - protocol.warm_up)), "right") - 1
-    if warm >= 0:
-        begin = max(begin, int(times[min(warm, first - 1)]))
+    # Reconstruction begins at a frame, if there is one, so that windows between frames are whole.
+    warm = int(times[first]) - round(1e6 * protocol.warm_up)
+    before = np.searchsorted(times, warm, "right") - 1
+    begin = max(begin, warm if before < 0 else int(times[min(before, first - 1)]))
     windows = protocol.windows
     if windows == Windows():
         windows = usual(recording.events())

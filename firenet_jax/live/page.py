@@ -38,6 +38,7 @@ PAGE = """<!doctype html>
 const names = {events_per_second: "events a second", windows_per_second: "pictures a second",
   latency_ms: "latency, median, ms", latency_95_ms: "latency, 95 % below, ms",
   dropped_windows: "windows dropped", bad_events: "events left out"};
+const title = document.title;
 let before = null;
 async function look() {
   try {
@@ -48,6 +49,7 @@ async function look() {
       now.windows_per_second = ((now.windows - before.windows) / s).toFixed(1);
     }
     before = {...now, at};
+    document.title = title;
     const list = document.getElementById("figures");
     list.replaceChildren(...Object.entries(names).map(([key, text]) => {
       const box = document.createElement("div"), dt = document.createElement("dt"),

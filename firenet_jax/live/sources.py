@@ -28,6 +28,7 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError, logger
 from firenet_jax.events import Events, Recording
+from firenet_jax.readers import text
 from firenet_jax.windows import MAX_GAP
 
 TICK = 0.005  # seconds between two looks at a source that has nothing
@@ -37,6 +38,7 @@ BINARY = {
     "t64_x16_y16_on8": np.dtype([("t", "<u8"), ("x", "<u2"), ("y", "<u2"), ("on", "u1")]),
     "t32_x16_y15_on1": np.dtype([("t", "<u4"), ("x", "<u2"), ("y_on", "<u2")]),
 }
+FRACTION = b".", b"e", b"E"  # of which a number of seconds has one
 WIRES = (*BINARY, "text")
 NO_EVENTS = Events.empty()
 
@@ -97,7 +99,8 @@ def replay(
 def udp(host: str, port: int) -> Iterator[bytes]:
     """Datagrams that come to this address, each of whole events."""
     try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with socket.socket(family, socket.SOCK_DGRAM) as listening:
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**22)
             listening.bind((host, port))
             listening.settimeout(TICK)
@@ -221,20 +224,24 @@ class _Text:
 
     def __call__(self, data: bytes) -> tuple[Events, bytes]:
         lines, _, rest = data.rpartition(b"\n")
-        rows = [line.split() for line in lines.splitlines()]
-        rows = [row for row in rows if len(row) not in (0, 2) and not row[0].startswith(b"#")]
-        numbers = _numbers(rows)
+        rows = []
+        numbers = _events(text.numbers(lines)) if lines else None
+        if numbers is None or not self.seconds and any(sign in lines for sign in FRACTION):
+            rows = [line.split() for line in lines.splitlines()]
+            rows = [row for row in rows if len(row) not in (0, 2) and not row[0].startswith(b"#")]
+            numbers = _numbers(rows)
         if rows and numbers is None:
             rows = self._without_broken(rows)
             numbers = _numbers(rows)
         if numbers is None:
             return NO_EVENTS, rest
-        self.whole += len(rows)
+        self.whole += len(numbers)
         self.seconds |= any(b"." in row[0] or b"e" in row[0].lower() for row in rows)
         t, x, y, p = numbers.T
         t = np.rint(1e6 * t if self.seconds else t)
         if not (np.abs(t) < 2**53).all():
-            raise _refused(rows[int(np.argmax(np.abs(t)))])
+            place = int(np.argmax(np.abs(t)))
+            raise _refused(rows[place] if rows else lines.split()[4 * place :][:4])
         return Events(t.astype(np.int64), x.astype(np.int16), y.astype(np.int16), p > 0), rest
 
     def _without_broken(self, rows: list[list[bytes]]) -> list[list[bytes]]:
@@ -262,10 +269,14 @@ def _refused(row: list[bytes]) -> RecordingError:
 def _numbers(rows: list[list[bytes]]) -> np.ndarray | None:
     """Lines -> (N, 4) float64; None where one of them is no event, or there are none."""
     try:
-        numbers = np.array(rows, np.float64)
+        return _events(np.array(rows, np.float64))
     except ValueError:
         return None
-    if numbers.shape[1:] != (4,):
+
+
+def _events(numbers: np.ndarray | None) -> np.ndarray | None:
+    """None if they cannot be rows of t x y p."""
+    if numbers is None or numbers.shape[1:] != (4,):
         return None
     t, x, y, _ = np.abs(numbers).T
     return numbers if (t < 2**53).all() and (np.maximum(x, y) < 2**15).all() else None

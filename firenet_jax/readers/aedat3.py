@@ -157,7 +157,7 @@ def _frames(layout: Layout) -> Frames | None:
     """A damaged frame is left out, with a notice; after a damaged packet there are none, and it
     raises its error as events are read."""
     times, entries = [], []  # an entry: (offset, bytes)
-    damaged, first = 0, None
+    damaged, first, damage = 0, None, None
     try:
         for packet, file in _of_kind(layout, FRAME):
             for number in range(packet.count):
@@ -171,8 +171,8 @@ def _frames(layout: Layout) -> Frames | None:
                     begin, end = int(head["open"]), int(head["shut"])
                     times.append((begin + end) // 2 + (packet.wraps << 31))
                     entries.append((offset, packet.size))
-    except RecordingError:
-        pass
+    except RecordingError as error:
+        damage = error
     if damaged:
         logger.warning(
             "%s: damaged frames are left out: %d, the first at byte %d",
@@ -180,7 +180,8 @@ def _frames(layout: Layout) -> Frames | None:
         )  # fmt: skip
     if not entries:
         return None
-    return Frames(np.array(times, np.int64), lambda i: _frame(layout.path, *entries[i]))
+    at = np.array(times, np.int64)
+    return Frames(at, lambda i: _frame(layout.path, *entries[i]), damage=damage)
 
 
 def _frame_head(file: BinaryIO, offset: int, size: int) -> np.void:

@@ -246,18 +246,18 @@ def _frames(path: Path, layout: Layout) -> Frames | None:
     """Up to the first that is damaged; a damaged packet raises its error as events are read."""
     if layout.frames is None:
         return None
-    times, packets = [], []  # a packet: (offset, size)
+    times, packets, damage = [], [], None  # a packet: (offset, size)
     try:
         with open(path, "rb") as file:
             for offset, size in _packets(path, file, layout, layout.frames):
                 times.append(_time(_unpacked(file, layout, offset, size, HEAD)))
                 packets.append((offset, size))
-    except (RecordingError, *DAMAGED):
-        pass
+    except (RecordingError, *DAMAGED) as error:
+        damage = error
     if not packets:
         return None
     times = np.array(times[: len(packets)], np.int64)
-    return Frames(times, lambda i: _frame(path, layout, packets[i]))
+    return Frames(times, lambda i: _frame(path, layout, packets[i]), damage=damage)
 
 
 def _is_grey(path: Path, layout: Layout, stream: int) -> bool:

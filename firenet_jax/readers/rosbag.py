@@ -402,7 +402,7 @@ def _triggers(path: Path, topic: str) -> Iterator[tuple[np.ndarray, ...]]:
 def _frames(path: Path, bag, topic: str | None) -> Frames | None:
     if topic is None:
         return None
-    stamps, recorded, ros2 = [], [], not _is_ros1(path)
+    stamps, recorded, ros2, damage = [], [], not _is_ros1(path), None
     try:
         for time, raw in _raw(bag, topic):
             message = _Message(raw, ros2)
@@ -412,6 +412,7 @@ def _frames(path: Path, bag, topic: str | None) -> Frames | None:
                 return None
             recorded.append(time)
     except Exception as error:  # damaged bytes raise every kind; a torn bag's events raise it, too
+        damage = error
         if not isinstance(bag, tuple(TORN.values())):
             found = " ".join(str(error).split())
             logger.warning("%s: reads %d images of %s (%s)", path, len(recorded), topic, found)
@@ -424,7 +425,9 @@ def _frames(path: Path, bag, topic: str | None) -> Frames | None:
                     return _picture(path, message)
         raise RecordingError(f"{path}: frame {i + 1} of {topic} is not there any more")
 
-    return Frames(np.array(stamps[: len(recorded)], np.int64), read) if recorded else None
+    if not recorded:
+        return None
+    return Frames(np.array(stamps[: len(recorded)], np.int64), read, damage=damage)
 
 
 def _picture_head(message: _Message) -> tuple[int, int, str]:

@@ -342,6 +342,21 @@ def _table(block: bytes, layout: Layout) -> pa.Table:
     )
 
 
+def numbers(lines: bytes) -> np.ndarray | None:
+    """Lines of four numbers with a space between them -> (N, 4) float64; None for any others."""
+    kinds = dict.fromkeys("txyp", pa.float64())
+    try:
+        table = pyarrow.csv.read_csv(
+            pa.BufferReader(lines),
+            pyarrow.csv.ReadOptions(column_names=list(kinds), use_threads=False),
+            pyarrow.csv.ParseOptions(delimiter=" ", quote_char=False),
+            pyarrow.csv.ConvertOptions(column_types=kinds, null_values=[]),
+        )
+    except pa.ArrowInvalid:
+        return None
+    return np.stack([table[name].to_numpy() for name in kinds], 1)
+
+
 def _tidied(block: bytes, separator: str) -> bytes:
     """Any run of spaces and tabs -> one separator between words, none at the ends of a line; no
     word begins with a plus, which pyarrow takes for no number."""

@@ -58,7 +58,8 @@ class BagWriter:
     def _start(self) -> Any:
         """At the first picture: SQLite serves only the thread that opened the database."""
         _remove(self.partial, self.path)  # of a run that was killed
-        choice = {"version": 9} if self.ros2 else {}
+        # Humble cannot read 9; all later ones read 8.
+        choice = {"version": 8} if self.ros2 else {}
         bag = self.bag = self.library.Writer(self.partial, **choice)
         bag.open()
         if os.name != "nt":  # no locks there, and folders cannot be opened
