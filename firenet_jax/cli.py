@@ -183,6 +183,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"firenet: interrupted; {goes_on}", file=sys.stderr)
         return 130
     except Exception as error:
+        if isinstance(error, BrokenPipeError) and error.filename is None:
+            return 1  # who reads no further, as `head`, knows that
         said = sentence(error, name)
         if said is None:
             error.add_note(REPORT)

@@ -162,6 +162,8 @@ def test_expanded_tensor_costs_no_memory(file, layout):
         "logger.logger Logger",
         "argparse Namespace",
         "numpy.core.multiarray scalar",
+        "collections Counter",
+        "__builtin__ set",
     ],
 )
 def test_known_companions_are_skipped(file, layout, name):
@@ -343,6 +345,15 @@ def test_instructions_without_end(file, layout, monkeypatch):
     assert list(read_state_dict(file(layout(TREE, STORAGES)))) == ["a", "b", "c"]
     with pytest.raises(CheckpointError, match="more than 1000 instructions"):
         read_state_dict(file(layout(whole(1000 * b"}"), SMALL)))
+
+
+def test_one_list_of_pairs_from_which_dicts_are_made_without_end(file, layout, monkeypatch):
+    """Six bytes of the file make a dict of all pairs: a megabyte could fill all memory."""
+    monkeypatch.setattr(pytorch_file, "MAX_INSTRUCTIONS", 2000)
+    pairs = b"]q\x01(" + b"".join(number(n) + b"N\x86" for n in range(200)) + b"e0"
+    made = b"ccollections\nOrderedDict\nq\x020](" + 20 * b"h\x02h\x01\x85R" + b"e"
+    with pytest.raises(CheckpointError, match="more than 2000 instructions and items"):
+        read_state_dict(file(layout(whole(pairs, made), SMALL)))
 
 
 def test_members_of_a_zip_that_overlap(file):

@@ -1699,6 +1699,14 @@ def test_damaged_samples(recordings, tmp_path):
         refused(path, "cannot be read", size=(480, 640))
 
 
+@pytest.mark.parametrize("name", ["davis346_59_frames.aedat4", "davis346_frames.aedat4"])
+def test_frames_of_half_a_sample_end_at_damage(recordings, tmp_path, name):
+    assert open_recording(recordings / name).frames.damage is None
+    content = (recordings / name).read_bytes()
+    half = open_recording(write(tmp_path / name, content[: len(content) // 2]), (480, 640))
+    assert len(half.frames.times) and half.frames.damage is not None
+
+
 CUT = ["davis240_boxes.aedat", "ros2_mcap/test_events_2_0.mcap",
        "davis346_frames.aedat4", "evt2_sparklers.raw", "evt3_driving.raw", "dvs_synthetic_sweep.es",
        "ncars.dat", "ncaltech101_faces_easy_0001.bin", "ros1_event_camera_msgs.bag"]  # fmt: skip

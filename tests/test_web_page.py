@@ -192,7 +192,53 @@ def test_times_that_are_none_are_named_by_the_page(tmp_path, monkeypatch):
     found = read_by_the_page("a.txt", "b.npy", "c.npy")
     assert found["a.txt"] == "a.txt, event 1: its time is Infinity"
     assert found["b.npy"] == "b.npy, event 0: its time is NaN"
-    assert found["c.npy"] == "c.npy: expected an array of numbers in C order"
+    assert found["c.npy"] == "c.npy: expected an array of numbers"
+
+
+def test_arrays_are_read_by_the_page_as_by_the_package(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    t, x, y, p = np.array([1000, 2500]), np.array([3, 9]), np.array([4, 5]), np.array([1, 0])
+    rows = np.stack([t / 1e6, x, y, p], 1)
+    kinds = [("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("polarity", "?")]
+    named = np.array(list(zip(t, x, y, p, strict=True)), kinds)
+    aligned = np.array(list(zip(t, x, y, p, strict=True)), np.dtype(kinds[::-1], align=True))
+    aligned["t"], aligned["polarity"] = t, p  # names choose, not places
+    aligned["x"], aligned["y"] = x, y
+    np.save("rows.npy", rows)
+    np.save("columns.npy", np.asfortranarray(rows))
+    np.save("named.npy", named)
+    np.save("aligned.npy", aligned)
+    np.savez("one.npz", rows)
+    np.savez("one_named.npz", events=named)
+    np.savez_compressed("both.npz", ts=2 * t, t=t, x=x, y=y, p=p, width=40, height=30)
+    names = ["rows.npy", "columns.npy", "named.npy", "aligned.npy", "one.npz", "one_named.npz",
+             "both.npz"]  # fmt: skip
+    found = read_by_the_page(*names)
+    for name in names:
+        recording = open_recording(Path(name))
+        events = concatenate([*recording.events()])
+        columns = [c.astype(int).tolist() for c in (events.t, events.x, events.y, events.p)]
+        assert found[name] == [recording.width, recording.height, *columns], name
+        assert columns[0] == [1000, 2500]
+
+
+def test_archives_that_are_of_no_use_are_named_by_the_page(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, method in {"two.zip": zipfile.ZIP_STORED, "bz.zip": zipfile.ZIP_BZIP2}.items():
+        with zipfile.ZipFile(name, "w", method) as archive:
+            archive.writestr("b/rec.txt", "0.1 1 2 1\n")
+            if name == "two.zip":
+                archive.writestr("calib.txt", "1 2 3\n")
+    with zipfile.ZipFile("bad.zip", "w") as archive:
+        archive.writestr("calib.txt", "1,2,3\n")
+        archive.writestr("a/events.txt", "0.1 1 2 1\n0.2 1 x 1\n")
+    Path("cut.txt.gz").write_bytes(gzip.compress(np.random.default_rng(0).bytes(999))[:500])
+    found = read_by_the_page("two.zip", "bz.zip", "bad.zip", "cut.txt.gz")
+    both = "two.zip: holds 2 text files (b/rec.txt, calib.txt) where one is expected"
+    assert found["two.zip"] == both
+    assert found["bz.zip"] == "bz.zip: b/rec.txt is packed by method 12: pack it anew"
+    assert found["bad.zip"].startswith("bad.zip, a/events.txt, line 2: expected t x y p")
+    assert found["cut.txt.gz"].startswith("cut.txt.gz: is damaged, cut short or too large (")
 
 
 def test_a_page_without_its_runtime_says_what_to_install(tmp_path, capsys, monkeypatch):
@@ -267,6 +313,26 @@ def test_a_page_that_cannot_be_is_one_sentence(tmp_path, capsys, runtime):
         code, _, error = firenet(capsys, line)
         assert code == 1 and said in error and error.count("\n") == 1, error
         assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_page_is_not_written_beside_a_file_that_cannot_be(tmp_path, capsys, runtime):
+    (tmp_path / "there.onnx").touch()
+    for line, said in [
+        ("-o new.pth --picture", "new.pth holds weights alone"),
+        ("-o there.onnx", "there.onnx exists"),
+        ("-o a.doc", "cannot write .doc files"),
+        ("--picture --no-normalise", "normalise, picture: no part in an export without --output"),
+    ]:
+        code, _, error = firenet(capsys, f"export --web page --sample a.txt {line}")
+        assert code == 1 and said in error and not (tmp_path / "page").exists()
+
+
+def test_a_sample_whose_size_is_said(tmp_path, capsys, runtime):
+    assert firenet(capsys, "export --web page --sample a.txt --sensor-size 33x32")[0] == 0
+    with np.load(tmp_path / "page" / "sample.npz") as sample:
+        assert (sample["width"], sample["height"]) == (33, 32)
+    code, _, error = firenet(capsys, "export --web other --sensor-size 33x32")
+    assert code == 1 and "sensor-size: no part in an export without --sample" in error
 
 
 @pytest.mark.slow

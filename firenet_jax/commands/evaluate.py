@@ -187,7 +187,8 @@ def run(settings: Evaluate) -> dict:
                 wanted = times_of(settings.times, recording, recording.events())
                 plans[name] = found._replace(wanted=wanted)
             except (Gap, RecordingError) as error:
-                logger.warning("%s: %s", recording.path, error)
+                said = str(error).removeprefix(f"{recording.path}: ")
+                logger.warning("%s: %s", recording.path, said)
                 gaps = {(name, method.name): str(error) for method in methods} | gaps
         compute(settings, records, plans, methods, learned, done, gaps)
         if not any(key in done for key in records):

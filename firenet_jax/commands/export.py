@@ -18,7 +18,7 @@ from firenet_jax.export.stablehlo import stablehlo
 from firenet_jax.export.tensors_file import pth, safetensors
 from firenet_jax.export.web_page import RUNTIME, runtime_version, write_page
 from firenet_jax.readers import open_recording
-from firenet_jax.settings import check_none_idle
+from firenet_jax.settings import check_none_idle, parse_size
 from firenet_jax.simulation.scenes import rendering_times, video
 from firenet_jax.simulation.sensor import event_list
 from firenet_jax.storage.files import OutputError, partial_name, writing
@@ -57,13 +57,23 @@ class Export:
     """--web: folder of onnxruntime-web, as installed by `npm install onnxruntime-web`."""
     sample: Path | None = None
     """--web: recording that the page starts with (its first seconds). Default: a simulated one."""
+    sensor_size: str | None = None
+    """--sample: WIDTHxHEIGHT of its sensor, such as 240x180, if the recording does not state it."""
     overwrite: bool = False
     """Replace an existing output."""
 
     def __post_init__(self):
         if self.web is None:
-            names = [n for n in ("runtime", "sample") if getattr(self, n) != getattr(Export, n)]
-            check_none_idle(names, "an export without --web")
+            self._check_idle("runtime", "sample", what="an export without --web")
+        if self.output is None:
+            self._check_idle("normalise", "picture", what="an export without --output")
+        if self.sample is None:
+            self._check_idle("sensor_size", what="an export without --sample")
+        parse_size(self.sensor_size)
+
+    def _check_idle(self, *names: str, what: str) -> None:
+        asked = [name for name in names if getattr(self, name) != getattr(Export, name)]
+        check_none_idle(asked, what)
 
 
 SAMPLE = 500_000  # events: some seconds, one or two megabytes
@@ -72,6 +82,8 @@ SAMPLE = 500_000  # events: some seconds, one or two megabytes
 def run(settings: Export) -> None:
     if settings.web is None and settings.output is None:
         raise OutputError("nothing to write: pass -o and a name such as model.onnx, or --web")
+    if settings.output is not None:
+        check_file(settings.output, settings)  # before the page: it is not written in vain
     if settings.web is not None:
         write_web(settings.web, settings)
     if settings.output is not None:
@@ -88,7 +100,7 @@ def write_web(folder: Path, settings: Export) -> None:
     if settings.sample is None:
         (height, width), events = SIMULATED, simulated(*SIMULATED, seconds=2.0)
     else:
-        recording = open_recording(settings.sample)
+        recording = open_recording(settings.sample, parse_size(settings.sensor_size))
         (height, width), events = (recording.height, recording.width), recording.events()
     held, size = [], 0
     for chunk in events:
@@ -118,17 +130,25 @@ def simulated(height: int, width: int, seconds: float) -> Iterator[Events]:
     return event_list(sensor, video(scene, times, height=height, width=width))
 
 
-def write_file(path: Path, settings: Export) -> None:
+def check_file(path: Path, settings: Export) -> None:
+    """Raises OutputError for what cannot be written."""
     if path.suffix not in KINDS:
         names = f"{', '.join(KINDS[:-1])} or {KINDS[-1]}"
         raise OutputError(f"{path}: cannot write {path.suffix or 'such'} files; try {names}")
-    runs = path.suffix in (".onnx", ".stablehlo")
-    if not runs and (settings.picture or not settings.normalise):
+    if not runs_of(path) and (settings.picture or not settings.normalise):
         raise OutputError(
             f"{path} holds weights alone: --picture and --no-normalise are for .onnx and .stablehlo"
         )
     if path.exists() and not settings.overwrite:
         raise OutputError(f"{path} exists; choose another name or pass --overwrite")
+
+
+def runs_of(path: Path) -> bool:
+    """Whether such a file is the network, not its weights alone."""
+    return path.suffix in (".onnx", ".stablehlo")
+
+
+def write_file(path: Path, settings: Export) -> None:
     weights = load_weights(settings.weights)
     inside = {"normalise": settings.normalise, "picture": settings.picture}
     content = {
@@ -141,6 +161,6 @@ def write_file(path: Path, settings: Export) -> None:
     with writing(path):
         beside.write_bytes(content)
         beside.replace(path)
-    normalised = weights.normalise and not (runs and settings.normalise)
+    normalised = weights.normalise and not (runs_of(path) and settings.normalise)
     tensors = "normalised" if normalised else "raw"
     print(f"{path}: {len(content) / 1000:.0f} kB, for {tensors} event tensors")

@@ -163,6 +163,11 @@ def plan(name: str, recording: Recording, protocol: Protocol) -> Plan:
     counting = np.flatnonzero((seconds >= start) & (seconds <= stop))
     counting = counting[counting > 0]  # no window ends at the first frame
     if not counting.size:
+        if protocol.start is None and protocol.stop is None and stop < math.inf:
+            raise Gap(
+                f"no frames from {start:g} to {stop:g} s, which count in the paper's recording of "
+                "this name: all do with --start 0"
+            )
         raise Gap(f"no frames from {start:g} to {stop:g} s")
     first, last = int(counting[0]), int(counting[-1]) + 1
     # Reconstruction begins at a frame, if there is one, so that windows between frames are whole.

@@ -385,6 +385,9 @@ _HARMLESS = [
     "numpy._core.multiarray.scalar",  # numpy 2
     "_codecs.encode",  # ... whose bytes protocol 2 writes as text
     "torch.device",
+    "collections.Counter",  # of learning-rate schedulers
+    "builtins.set",
+    "__builtin__.set",  # protocol 2
 ]
 GLOBALS: dict[str, Callable | _Type] = {
     "collections.OrderedDict": _ordered_dict,
@@ -453,6 +456,12 @@ def _extend(target, items: list) -> None:
     target.extend(items)
 
 
+def _length(args) -> int:
+    """Of the lists and dicts that a function is given."""
+    args = args if isinstance(args, tuple) else ()
+    return sum(len(arg) for arg in args if isinstance(arg, list | tuple | dict))
+
+
 def _call(function, args):
     # Nothing callable reaches the stack but the functions and stand-ins of GLOBALS.
     if not callable(function) or not isinstance(args, tuple):
@@ -492,9 +501,10 @@ def _unpickle(stream: io.BytesIO, storages: dict[str, _Storage]):
         return items
 
     arg: Any
+    copied = 0
     for number, (opcode, arg, _position) in enumerate(pickletools.genops(stream)):
-        if number == MAX_INSTRUCTIONS:
-            raise ValueError(f"a pickle of more than {MAX_INSTRUCTIONS} instructions")
+        if number + copied >= MAX_INSTRUCTIONS:
+            raise ValueError(f"a pickle of more than {MAX_INSTRUCTIONS} instructions and items")
         match opcode.name:
             case name if name in _VALUES:
                 stack.append(arg)
@@ -542,9 +552,12 @@ def _unpickle(stream: io.BytesIO, storages: dict[str, _Storage]):
             case "STACK_GLOBAL":
                 stack.append(_global(".".join(last(2))))
             case "REDUCE" | "NEWOBJ":
-                stack.append(_call(*last(2)))
+                function, args = last(2)
+                copied += _length(args)  # one list can be named again and again
+                stack.append(_call(function, args))
             case "NEWOBJ_EX":
                 function, args, _keywords = last(3)
+                copied += _length(args)
                 stack.append(_call(function, args))
             case "BINPERSID":
                 stack.append(_storage(storages, *last(1)))

@@ -13,6 +13,7 @@ const UNITS = { // microseconds in a unit: its names
   1: ["us", "usec", "µs", "μs", "microsecond", "microseconds"],
   1e-3: ["ns", "nsec", "nanosecond", "nanoseconds"],
 };
+const TEXT = 500e6; // bytes: a page's string has at most 2^29 characters
 const keyOf = (names, name) => Object.keys(names).find((key) => names[key].includes(name)) ?? "";
 const column = (name) => keyOf(NAMES, name);
 
@@ -21,23 +22,32 @@ const column = (name) => keyOf(NAMES, name);
 /** Uint8Array and its file's name -> events. Throws an Error of one sentence. */
 export async function readRecording(bytes, name) {
   const lower = name.toLowerCase();
-  if (lower.endsWith(".gz")) return readRecording(await inflated(bytes, "gzip"), name.slice(0, -3));
-  if (lower.endsWith(".npz")) return fromColumns(await npz(bytes, name), name);
-  if (lower.endsWith(".npy")) return fromRows(npy(bytes, name), name);
+  if (lower.endsWith(".gz"))
+    return readRecording(await inflated(bytes, "gzip", name), name.slice(0, -3));
+  if (lower.endsWith(".npz")) return npz(bytes, name);
+  if (lower.endsWith(".npy")) return fromArray(npy(bytes, name), name);
   if (lower.endsWith(".zip")) {
     const members = zipMembers(bytes, name).filter((m) => !m.name.startsWith("__MACOSX/"));
     const texts = members.filter((m) => /\.(txt|csv)$/i.test(m.name));
     const chosen = texts.find((m) => m.name.endsWith("events.txt")) ?? texts[0];
     if (!chosen) throw new Error(`${name}: no .txt or .csv is in this zip`);
-    return fromText(await unzipped(bytes, chosen), name);
+    if (texts.length > 1 && !chosen.name.endsWith("events.txt")) {
+      const some = texts.slice(0, 4).map((m) => m.name).join(", ");
+      throw new Error(`${name}: holds ${texts.length} text files (${some}) where one is expected`);
+    }
+    return fromText(await unzipped(bytes, chosen, name), `${name}, ${chosen.name}`);
   }
   if (/\.(txt|csv)$/.test(lower)) return fromText(bytes, name);
   throw new Error(`${name}: expected .txt, .csv, .zip, .gz, .npz or .npy`);
 }
 
-async function inflated(bytes, format) {
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream(format));
-  return new Uint8Array(await new Response(stream).arrayBuffer());
+async function inflated(bytes, format, name) {
+  try {
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream(format));
+    return new Uint8Array(await new Response(stream).arrayBuffer());
+  } catch (error) {
+    throw new Error(`${name}: is damaged, cut short or too large (${error.message})`);
+  }
 }
 
 /** Zip -> [{name, method, start, size}], from the list at its end (APPNOTE.TXT 4.3). */
@@ -62,45 +72,79 @@ function zipMembers(bytes, name) {
   return members;
 }
 
-async function unzipped(bytes, member) {
+async function unzipped(bytes, member, name) {
+  if (member.method !== 0 && member.method !== 8)
+    throw new Error(`${name}: ${member.name} is packed by method ${member.method}: pack it anew`);
   const packed = bytes.subarray(member.start, member.start + member.size);
-  return member.method === 0 ? packed : inflated(packed, "deflate-raw");
+  return member.method === 0 ? packed : inflated(packed, "deflate-raw", name);
 }
 
+/** A .npz -> events: of columns, the first of the names that one may have, or of one array. */
 async function npz(bytes, name) {
+  const members = zipMembers(bytes, name);
+  const array = async (member) => npy(await unzipped(bytes, member, name), `${name}, ${member.name}`);
   const columns = {};
-  for (const member of zipMembers(bytes, name)) {
-    const short = member.name.replace(/\.npy$/, "");
-    const key = column(short) || short;
-    if ([..."txyp", "width", "height"].includes(key))
-      columns[key] = npy(await unzipped(bytes, member), `${name}, ${member.name}`);
+  for (const [key, names] of Object.entries({ ...NAMES, width: ["width"], height: ["height"] })) {
+    const found = names.map((n) => members.find((m) => m.name === `${n}.npy`)).find((m) => m);
+    if (found) columns[key] = await array(found);
   }
-  return columns;
+  if (!columns.t && !columns.x && members.length === 1) return fromArray(await array(members[0]), name);
+  return fromColumns(columns, name);
 }
 
-/** A .npy of numbers -> {data, shape, whole}. */
+const KINDS = {
+  f4: Float32Array, f8: Float64Array, i1: Int8Array, i2: Int16Array, i4: Int32Array,
+  i8: BigInt64Array, u1: Uint8Array, u2: Uint16Array, u4: Uint32Array, u8: BigUint64Array,
+  b1: Uint8Array,
+};
+
+/** A .npy of numbers -> {data, shape, whole, fortran}; of a structured array, such by name. */
 function npy(bytes, name) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const long = bytes[6] > 1;
   const start = (long ? 12 : 10) + (long ? view.getUint32(8, true) : view.getUint16(8, true));
   const head = new TextDecoder().decode(bytes.subarray(0, start));
   const type = /'descr': '[<|]([fiub][1248])'/.exec(head)?.[1];
+  const fields = [...head.matchAll(/\('([^']*)', '[<|]([fiubV])(\d+)'\)/g)];
   const shape = /'shape': \(([^)]*)\)/.exec(head)?.[1].split(",").filter((s) => s.trim()).map(Number);
-  const kinds = {
-    f4: Float32Array, f8: Float64Array, i1: Int8Array, i2: Int16Array, i4: Int32Array,
-    i8: BigInt64Array, u1: Uint8Array, u2: Uint16Array, u4: Uint32Array, u8: BigUint64Array,
-    b1: Uint8Array,
-  };
-  if (!kinds[type] || !shape || head.includes("True"))
-    throw new Error(`${name}: expected an array of numbers in C order`);
-  let data = new kinds[type](bytes.slice(start).buffer);
-  if (type.endsWith("8") && type !== "f8") data = Float64Array.from(data, Number);
-  return { data, shape, whole: type[0] !== "f" };
+  if (shape?.length === 1 && fields.length) return structured(bytes.slice(start), fields, shape[0]);
+  if (!KINDS[type] || !shape) throw new Error(`${name}: expected an array of numbers`);
+  const data = numbers(bytes.slice(start), type);
+  return { data, shape, whole: type[0] !== "f", fortran: /'fortran_order': True/.test(head) };
 }
 
-function fromRows({ data, shape, whole }, name) {
+function numbers(bytes, type) {
+  const size = Number(type[1]);
+  const data = new KINDS[type](bytes.buffer, 0, Math.floor(bytes.length / size));
+  return size === 8 && type !== "f8" ? Float64Array.from(data, Number) : data;
+}
+
+/** Rows of fields -> {name: {data, whole}}, of fields of other kinds none. */
+function structured(bytes, fields, rows) {
+  const row = fields.reduce((sum, [, , , size]) => sum + Number(size), 0);
+  const found = {};
+  let offset = 0;
+  for (const [, name, kind, size] of fields) {
+    if (KINDS[kind + size]) {
+      const own = new Uint8Array(rows * size);
+      for (let n = 0; n < rows; n++)
+        for (let k = 0; k < size; k++) own[n * size + k] = bytes[n * row + offset + k];
+      found[name] = { data: numbers(own, kind + size), whole: kind !== "f" };
+    }
+    offset += Number(size);
+  }
+  return found;
+}
+
+function fromArray(array, name) {
+  if (!array.data) { // structured
+    const of = (key) => array[NAMES[key].find((n) => array[n])];
+    return fromColumns({ t: of("t"), x: of("x"), y: of("y"), p: of("p") }, name);
+  }
+  const { data, shape, whole, fortran } = array;
   if (shape.length !== 2 || shape[1] !== 4) throw new Error(`${name}: expected rows of t, x, y, p`);
-  const of = (k) => ({ data: Float64Array.from({ length: shape[0] }, (_, n) => data[4 * n + k]), whole });
+  const [step, next] = fortran ? [1, shape[0]] : [4, 1];
+  const of = (k) => ({ data: Float64Array.from({ length: shape[0] }, (_, n) => data[step * n + next * k]), whole });
   return fromColumns({ t: of(0), x: of(1), y: of(2), p: of(3) }, name);
 }
 
@@ -134,6 +178,8 @@ function namesOf(line) {
 /** Lines `t x y p`, perhaps after a line `width height` or one of names. Times with a decimal point
  * or an exponent are seconds, where no name tells a unit. */
 function fromText(bytes, name) {
+  if (bytes.length > TEXT)
+    throw new Error(`${name}: holds more than ${TEXT / 1e6} MB of text, which a browser cannot: cut it`);
   const lines = new TextDecoder().decode(bytes).split("\n");
   const number = (word) => { // False and True are 0 and 1
     const value = Number(word || NaN);
