@@ -49,7 +49,8 @@ def check_none_idle(names: list[str], where: str) -> None:
     """Raises SettingsError, naming them, if there are options that have no effect there."""
     if names:
         said = ", ".join(names).replace("_", "-")
-        raise SettingsError(f"{said}: no part in {where}: leave it out")
+        them = "it" if len(names) == 1 else "them"
+        raise SettingsError(f"{said}: no part in {where}: leave {them} out")
 
 
 def check_range(name: str, bounds: tuple[float, float]) -> None:

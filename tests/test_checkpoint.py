@@ -1,6 +1,7 @@
 import importlib.resources
 import os
 import zipfile
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -388,3 +389,12 @@ def test_published_network_computes_what_its_authors_code_computes(reference, tm
     for tensor, expected in zip(io["event_tensors"], io["images"], strict=True):
         state, image = step(weights.params, state, tensor.transpose(1, 2, 0)[None])
         np.testing.assert_allclose(image, expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("given", ["built-in", "a run", "weights.npz"])
+def test_what_is_already_converted_is_said(tmp_path, monkeypatch, given):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a run").mkdir()
+    with pytest.raises(CheckpointError, match="are used as they are, and `firenet export` makes"):
+        run(Convert(Path(given), tmp_path / "out.npz"))
+    assert not (tmp_path / "out.npz").exists()

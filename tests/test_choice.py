@@ -41,6 +41,22 @@ def nothing_made(monkeypatch, afresh):
     monkeypatch.setattr(choice, "_failure", [])
 
 
+@pytest.mark.parametrize("flag", ["jax_disable_jit", "jax_debug_nans"])
+def test_without_programs_and_where_nans_are_looked_for(case, flag):
+    weights, state, tensors = case
+    expected = reconstruct(weights, state, tensors)[1]
+    before = getattr(jax.config, flag)
+    jax.config.update(flag, True)
+    try:
+        found = reconstruct(weights, state, tensors)[1]
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+        if flag == "jax_debug_nans":
+            with pytest.raises(FloatingPointError):
+                reconstruct(weights, state, tensors.at[0, 0, 0, 0, 0].set(jnp.nan))
+    finally:
+        jax.config.update(flag, before)
+
+
 def is_machine_code(function, *arguments):
     return "custom_call" in jax.jit(function).lower(*arguments).as_text()
 

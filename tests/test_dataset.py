@@ -363,7 +363,7 @@ def test_a_file_that_another_run_has_just_written_is_not_emptied(tmp_path, monke
 def test_a_run_with_more_sequences_adds_the_others(tmp_path, capsys):
     run(settings(tmp_path, sequences=1, validation=0))
     run(settings(tmp_path, sequences=3, validation=1))
-    assert "2 are new" in capsys.readouterr().out.splitlines()[-1]
+    assert "new: 2, " in capsys.readouterr().out.splitlines()[-1]
     with pytest.raises(OutputError, match="validation holds 1 sequences already, .* want 0"):
         run(settings(tmp_path, sequences=3, validation=0))
 
@@ -551,7 +551,10 @@ def test_everything_wrong_is_one_sentence(tmp_path, monkeypatch, capsys):
         ("-o new --asymmetry .3 --faults", "--asymmetry says more of --threshold-range"),
         ("-o new --noise-in-light .1 .5", "--noise-in-light says more of --noise"),
         ("-o new --cutoff-dark .5 --faults --cutoff 0 0", "--cutoff-dark says more of --cutoff"),
-        ("-o new.h5 --video clip.mp4 --fps 5 --objects 7", "fps, scene: no part in turning"),
+        (
+            "-o new.h5 --video clip.mp4 --fps 5 --objects 7",
+            "fps, objects: no part in turning",
+        ),
         ("-o new.h5 --video clip.mp4 --flicker .1 .9", "too far apart to show it"),
     ],
 )

@@ -81,6 +81,22 @@ def test_normalises_as_tensors_do(height, width):
     assert abs(raw[1][0] - found[1][0]).max() > 1e-3  # it does make a difference
 
 
+def test_arrays_that_do_not_fit_together_are_left_to_xla():
+    """Machine code would read, and write, beyond their ends."""
+    params, tensors = random_run(steps=1, batch=2, height=3, width=4)
+    packed, (g1, g2), tensor = native.pack(params), random_state(2, 3, 4), tensors[0]
+    exists = jnp.ones(2, bool)
+    native.step(packed, (g1, g2), tensor, exists, np.bool_(True))
+    for wrong in [
+        (packed[:-1], (g1, g2), tensor, exists), (packed, (g1[:1], g2), tensor, exists),
+        (packed, (g1, g2[:, :2]), tensor, exists), (packed, (g1, g2), tensor[..., :4], exists),
+        (packed, (g1, g2), tensor, exists[:1]), (packed, (g1, g2), tensor.astype("int32"), exists),
+        (packed, (g1.astype("bfloat16"), g2), tensor, exists),
+    ]:  # fmt: skip
+        with pytest.raises(native.Unavailable):
+            native.step(*wrong)
+
+
 @pytest.mark.parametrize("halves", [(1,), (1, 2), (5 / 8, 3 / 2)])
 def test_winograd_is_a_correlation(halves):
     direction = winograd._winograd(*halves)

@@ -93,6 +93,10 @@ def test_recordings_that_cannot_be_learnt_from_are_said(tmp_path, folder):
         train.cut_off(tmp_path / "events.txt", 3)
     with pytest.raises(RecordingError, match="has 20 frames, but 22 are needed.*fewer --windows"):
         train.cut_off(folder, 10)
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "readme.md").touch()
+    with pytest.raises(RecordingError, match="notes: holds no HDF5 sequences"):
+        train.cut_off(tmp_path / "notes", 3)
     assert train.cut_off(folder, 9).end == 10
     backwards = tmp_path / "backwards.h5"
     pictures = [Picture(t, np.zeros((8, 8), np.uint8), None) for t in (0, 20_000, 10_000)]

@@ -7,7 +7,7 @@ from typing import Annotated
 import jax
 import tyro
 
-from firenet_jax.checkpoint import CheckpointError, convert, save_weights
+from firenet_jax.checkpoint import BUILT_IN, CheckpointError, convert, save_weights
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,13 @@ class Convert:
 def run(settings: Convert) -> None:
     if settings.output.exists() and not settings.overwrite:
         raise CheckpointError(f"{settings.output} exists; choose another name or pass --overwrite")
-    weights = convert(settings.checkpoint)
+    given = settings.checkpoint
+    if str(given) == BUILT_IN or given.is_dir() or given.suffix == ".npz":
+        raise CheckpointError(
+            f"{given}: is not a PyTorch checkpoint; weights of this program are used as they are, "
+            "and `firenet export` makes .pth, .onnx and others of them"
+        )
+    weights = convert(given)
     save_weights(settings.output, weights)
     count = sum(value.size for value in jax.tree.leaves(weights.params))
     tensors = "normalised" if weights.normalise else "raw"

@@ -34,7 +34,7 @@ from firenet_jax.evaluation.methods import METHODS, Method, Missing, digest, loa
 from firenet_jax.evaluation.protocol import Protocol, evaluate, plan, steps_of, until
 from firenet_jax.evaluation.results import METRICS, Measured, mean, summary
 from firenet_jax.events import Recording
-from firenet_jax.readers import FORMATS, aedat, open_recording
+from firenet_jax.readers import aedat, is_recording, open_recording
 from firenet_jax.settings import check_none_idle, parse_size
 from firenet_jax.storage.files import identity, named, read_arrays, write_arrays, write_text
 from firenet_jax.storage.progress import bar
@@ -252,11 +252,6 @@ def find_sequences(paths: tuple[Path, ...]) -> dict[str, Path]:
                 )
             found[name] = recording
     return found
-
-
-def is_recording(path: Path) -> bool:
-    modules = (importlib.import_module(f"firenet_jax.readers.{name}") for name in FORMATS)
-    return any(module.matches(path) for module in modules)
 
 
 def recordings_in(folder: Path, above: frozenset[Path] = frozenset()) -> list[Path]:

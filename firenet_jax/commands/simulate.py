@@ -22,8 +22,8 @@ import tyro
 
 from firenet_jax.devices import share
 from firenet_jax.errors import OutputError, PictureError, SettingsError
-from firenet_jax.events import Events
-from firenet_jax.settings import check_seed, parse_size
+from firenet_jax.events import Events, counted
+from firenet_jax.settings import check_none_idle, check_seed, parse_size
 from firenet_jax.simulation.clip import read_clip
 from firenet_jax.simulation.scenes import (
     Scene,
@@ -126,11 +126,11 @@ class Simulate:
         share(self.process, self.processes)
         check_idle(with_faults(self.sensor) if self.faults else self.sensor)
         if self.video is not None:
-            idle = [name for name in OF_SCENES if getattr(self, name) != getattr(Simulate, name)]
-            if idle:
-                raise SettingsError(
-                    f"{', '.join(idle)}: no part in turning a video into events: leave it out"
-                )
+            plain = [name for name in OF_SCENES if name != "scene"]
+            idle = [name for name in plain if getattr(self, name) != getattr(Simulate, name)]
+            scene = vars(self.scene).items()
+            idle += [name for name, value in scene if value != getattr(SceneSettings, name)]
+            check_none_idle(idle, "turning a video into events")
             if self.sensor.flicker is not None:
                 raise SettingsError(
                     "flicker: pictures of a video are too far apart to show it: leave it out"
@@ -232,10 +232,11 @@ def write_sequences(
             progress.set_postfix_str(
                 f"{in_words(mean)} each, {in_words(mean * len(work))} in all", refresh=False
             )
+    held = "" if split["validation"] else " (training holds out one in twenty, at least one)"
     print(
-        f"{settings.output}: {split['train']} sequences for training and {split['validation']} "
-        f"for validation, {settings.seconds:g} s each at {width}x{height}; {len(missing)} are new: "
-        f"{events:,} events, {in_words(used)}"
+        f"{settings.output}: {counted(split['train'], 'sequence')} for training and "
+        f"{split['validation']} for validation{held}, {settings.seconds:g} s each at "
+        f"{width}x{height}; new: {len(missing)}, {events:,} events, {in_words(used)}"
     )
     return [path for path, *_ in work]
 

@@ -29,7 +29,7 @@ from firenet_jax.evaluation.equalise import equalise
 from firenet_jax.evaluation.protocol import first_event
 from firenet_jax.events import Events, Frames, Recording, counted
 from firenet_jax.network import Weights, initial_state
-from firenet_jax.readers import open_recording
+from firenet_jax.readers import is_recording, open_recording
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.storage import runs
 from firenet_jax.storage.files import identity, write_text
@@ -92,6 +92,11 @@ def cut_off(path: Path, windows: int) -> Cut:
     Raises RecordingError where it has no frames, too few of them for both parts, or no events in
     their time.
     """
+    if path.is_dir() and not is_recording(path):
+        raise RecordingError(
+            f"{path}: holds no HDF5 sequences, as `firenet simulate` makes them: name another "
+            "folder, or recordings themselves"
+        )
     recording = open_recording(path)
     frames = recording.frames
     if frames is None or len(frames.times) < 2:
@@ -111,7 +116,8 @@ def cut_off(path: Path, windows: int) -> Cut:
     if count - held < windows + 1:  # a start is drawn from one place or more
         raise RecordingError(
             f"{path}: has {count + 1} frames, but {2 * windows + 2} are needed to learn from "
-            f"{windows} windows in a row and to hold out as many: ask for fewer --windows"
+            f"{windows} windows in a row and to hold out as many: use a longer recording, or fewer "
+            "--windows (and a smaller --l0)"
         )
     try:
         first_event(recording, frames.times)

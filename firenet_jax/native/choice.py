@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial
 from threading import RLock
+from typing import Any
 
 import jax
 from jax.core import ShapedArray
@@ -47,8 +48,12 @@ _choice.multiple_results = True
 
 
 @_choice.def_impl
-def _outside_of_programs(*arguments, **parameters):
-    return jax.jit(partial(_choice.bind, **parameters))(*arguments)
+def _outside_of_programs(*arguments, xla, **parameters):
+    # Without programs jit would come back here, and to find a NaN's origin it would, too.
+    config: Any = jax.config
+    if config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs:
+        return xla(*arguments)
+    return jax.jit(partial(_choice.bind, xla=xla, **parameters))(*arguments)
 
 
 @_choice.def_abstract_eval

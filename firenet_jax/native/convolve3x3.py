@@ -36,6 +36,7 @@ from firenet_jax.native.llvm import (
 from firenet_jax.native.winograd import COLUMNS, PIXEL, PLACES, Block, Tiling, kernels
 
 ROWS = 4  # of the result: what a thread takes at a time
+MOST_INPUTS = 4096  # what is around a block's pixels is copied to a thread's stack
 
 
 class Layer(NamedTuple):
@@ -342,6 +343,7 @@ def check(kernel: jax.Array, maps: Sequence[jax.Array], others: Sequence[jax.Arr
     arrays = (*maps, *others)
     is_ours = all(x.size and x.dtype == jnp.float32 for x in (kernel, *arrays))
     fits = len({x.shape[:3] for x in arrays}) == 1
-    fits = fits and kernel.shape[:3] == (3, 3, sum(x.shape[3] for x in maps))
+    inputs = sum(x.shape[3] for x in maps)
+    fits = fits and kernel.shape[:3] == (3, 3, inputs) and inputs <= MOST_INPUTS
     if vectors() == 0 or not is_ours or not fits:
         raise Unavailable

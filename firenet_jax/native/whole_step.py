@@ -426,7 +426,7 @@ def _stages(module: Module, size: Size, normalise: bool) -> list[Code]:
 def _make(height: int, width: int, normalise: bool) -> str:
     """Compiles the step for images of this size -> the name by which XLA knows it."""
     size, module = Size(height, width), Module()
-    name = f"firenet_step_{height}_{width}" + "_normalised" * normalise
+    name = f"firenet_step_{height}_{width}" + ("_normalised" if normalise else "")
     stages = _stages(module, size, normalise)
     register(name, module, stages, size.down, arguments=5, results=3, scratch=size.inner)
     return name
@@ -451,9 +451,14 @@ def step(
     that a state that comes from outside is not copied.
     Raises Unavailable where there is no machine code for it.
     """
-    batch, height, width, _ = tensor.shape
+    batch, height, width, bins = tensor.shape
     exists = jnp.ones(batch) if exists is None else exists
-    if vectors() == 0 or not tensor.size:
+    # Of arrays that do not fit together machine code would read beyond the end.
+    fit = bins == BINS and 4 * packed.size == _weights(len(STAGES)) + 2 * PIXEL
+    fit = fit and exists.shape == (batch,)
+    fit = fit and all(h.shape == (batch, height, width, CHANNELS) for h in state)
+    float32 = all(x.dtype == jnp.float32 for x in (packed, tensor, *state))
+    if vectors() == 0 or not tensor.size or not fit or not float32:
         raise Unavailable
     shapes = [h.shape for h in state] + [(batch, height, width)]
     call = jax.ffi.ffi_call(

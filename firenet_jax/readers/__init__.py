@@ -107,6 +107,12 @@ def open_recording(
     )
 
 
+def is_recording(path: Path) -> bool:
+    """Whether a format knows it, by its name or what a folder holds."""
+    modules = (importlib.import_module(f"{__name__}.{name}") for name in FORMATS)
+    return any(module.matches(path) for module in modules)
+
+
 def _source(path: Path, sensor_size: tuple[int, int] | None, columns: str | None) -> Source:
     """What the first format that knows the file reads from it."""
     if not path.exists():

@@ -80,7 +80,8 @@ def run(
     ):
         if saved.latest_step() is not None:
             state = restored(saved, state)
-            logger.warning("%s: going on after step %d", folder, state.step)
+            going_on = "its %d steps are done" if state.step >= settings.steps else None
+            logger.warning(f"%s: {going_on or 'going on after step %d'}", folder, state.step)
         prepare()
         done = int(state.step)
         sources, validation = sources_of(settings, done)
@@ -302,9 +303,16 @@ def _check_settings(folder: Path, settings: Train) -> None:
             folder, found["steps"], settings.steps,
         )  # fmt: skip
         return
+    same_place = all(found[name] == now[name] for name in ("data", "images"))
+    if same_place and found["files"] != now["files"]:
+        what = settings.data[0] if settings.data else settings.images
+        raise OutputError(
+            f"{what} has changed since the run in {folder} began: choose another --output, with "
+            f"--weights {folder} to begin with its weights"
+        )
     runs.check_same(
         found, now, f"{folder} holds a run with other settings",
-        "choose another --output, or go on with the same settings", but=UNRECORDED,
+        "choose another --output, or go on with the same settings", but=(*UNRECORDED, "files"),
     )  # fmt: skip
 
 
