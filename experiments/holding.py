@@ -7,10 +7,10 @@ trained, and each step also has
     rest        states that earlier steps left, when nothing follows, or balanced noise: the image
                 is to stay as it was before
     palindrome  windows of earlier steps backward and forward again (time reversed, polarity
-                inverted), many times: each image is to be that of the first round, which
+                inverted), up to forty times: each image is to be that of the first round, which
                 begins when the state has seen both directions
 
-    loss = L + 20 w (|I - I_0| + 3 |mean(I - I_0)|) for each of the two, 20 windows in a step
+    loss = L + 20 HOLD (|I - I_0| + 3 |mean(I - I_0)|) for each of the two, 20 windows in a step
 
 I_0 is what the network itself made, then: it may become another, but is to stay that. Gradients
 reach back over the windows of a step, states go on. What is written is a moving average.
@@ -44,17 +44,10 @@ from firenet_jax.training.step import (
 
 NOISES = np.array([0, 0.02, 0.35, 0.1], np.float32)  # events per pixel, of each place at rest
 LONGEST, SHORTER = 30, 0.5  # steps of a rest; the share of those that end earlier
+TURNING, TURNS = 2, (6, 40)  # places that go to and fro; so many times
+CUT = 64  # pixels on a side of both
+HOLD = 2.0
 RAMP, DECAY = 40, 0.995  # steps until the rate is reached; of the average
-
-
-class Holding(NamedTuple):
-    """How much is held, and how strictly."""
-
-    rest: float = 2.0  # weights, w above
-    palindrome: float = 2.0
-    turning: int = 2  # places that go to and fro
-    turns: tuple[int, int] = (6, 40)  # so many times
-    cut: int = 64  # pixels on a side of all places
 
 
 class Held(NamedTuple):
@@ -68,13 +61,13 @@ class Held(NamedTuple):
     passes: jax.Array  # (M,) int32, how often they have been passed
 
 
-def nothing_held(windows: int, holding: Holding) -> Held:
-    size = holding.cut, holding.cut
-    moving = jnp.zeros((windows, holding.turning, *size))
+def nothing_held(windows: int) -> Held:
+    size = CUT, CUT
+    moving = jnp.zeros((windows, TURNING, *size))
     return Held(
         initial_state(len(NOISES), *size), jnp.zeros((len(NOISES), *size)),
-        initial_state(holding.turning, *size), jnp.zeros((*moving.shape, 5)),
-        (moving, moving), jnp.zeros(holding.turning, jnp.int32),
+        initial_state(TURNING, *size), jnp.zeros((*moving.shape, 5)),
+        (moving, moving), jnp.zeros(TURNING, jnp.int32),
     )  # fmt: skip
 
 
@@ -91,18 +84,17 @@ def next_pass(held: Held) -> tuple[jax.Array, jax.Array]:
     return tensors, jnp.where(back, *held.first)
 
 
-@partial(jax.jit, static_argnames=("settings", "holding"), donate_argnames="state")
+@partial(jax.jit, static_argnames="settings", donate_argnames="state")
 def hold_step(
     state: TrainState, held: Held, source: tuple[jax.Array, jax.Array],
-    ends: tuple[jax.Array, jax.Array], rate: jax.Array, settings: StepSettings, holding: Holding,
+    ends: tuple[jax.Array, jax.Array], rate: jax.Array, settings: StepSettings,
 ) -> tuple[TrainState, Held, dict[str, jax.Array]]:  # fmt: skip
     """source: as of `train_step`; ends: (N,) and (M,) bool, what ends with this step; rate: by
     which the update is multiplied."""
     (key, textures), number = source, state.step
     data, (seen, before), warm = steps_of._simulated(key, textures, settings, state)
     noise_key, cut_key = jax.random.split(jax.random.fold_in(key, number + 10**6))
-    cut = holding.cut
-    size = settings.windows, len(NOISES), cut, cut, 5
+    size = settings.windows, len(NOISES), CUT, CUT, 5
     noise, (tensors, first) = balanced(noise_key, size, NOISES), next_pass(held)
 
     def loss(params):
@@ -112,7 +104,7 @@ def hold_step(
         rest = moved(at_rest, held.before[None], (held.before.max((-2, -1)) > 0) * 1.0)
         palindrome = moved(passed, first, (held.passes >= 4) * 1.0)
         terms |= {"loss": value, "rest": rest, "palindrome": palindrome}
-        value += settings.windows * (holding.rest * rest + holding.palindrome * palindrome)
+        value += settings.windows * HOLD * (rest + palindrome)
         return value, (terms, last, images, rested, turned, passed)
 
     gradient, (terms, last, images, rested, turned, passed) = jax.grad(loss, has_aux=True)(
@@ -129,11 +121,11 @@ def hold_step(
     state = TrainState(params, optimised, state.step + 1, (seen, last))
 
     # What has ended begins anew with a part of what this step saw.
-    corner = jax.random.randint(cut_key, (2,), 0, settings.crop - cut + 1)
+    corner = jax.random.randint(cut_key, (2,), 0, settings.crop - CUT + 1)
 
     def renewed(old, new, ending, axis=0, start=1):
         for i in range(2):
-            new = jax.lax.dynamic_slice_in_dim(new, corner[i], cut, start + i)
+            new = jax.lax.dynamic_slice_in_dim(new, corner[i], CUT, start + i)
         new = jnp.take(new, (jnp.arange(len(ending)) + number) % settings.batch, axis)
         chosen = jnp.expand_dims(ending, [n for n in range(new.ndim) if n != axis])
         return jnp.where(chosen, new, old)
@@ -154,9 +146,7 @@ def hold_step(
     return state, held, terms
 
 
-def train_and_hold(
-    path: Path, settings: Train, made: Path, steps: int, holding: Holding = Holding()
-) -> Path:
+def train_and_hold(path: Path, settings: Train, made: Path, steps: int) -> Path:
     """Trains the weights at `path` with these settings; writes them to `made`."""
     weights, step_settings = load_weights(path), replace(settings, steps=10**7).step_settings
     textures = load_textures(
@@ -164,15 +154,15 @@ def train_and_hold(
     )
     source = jax.random.key(settings.seed + 1), jnp.asarray(textures)
     state = initial_train_state(jax.tree.map(jnp.array, weights.params), step_settings)
-    held, average = nothing_held(settings.windows, holding), jax.tree.map(jnp.array, weights.params)
+    held, average = nothing_held(settings.windows), jax.tree.map(jnp.array, weights.params)
     rng = np.random.default_rng(settings.seed)
-    left = np.ones(len(NOISES), int), np.ones(holding.turning, int)  # steps of each
+    left = np.ones(len(NOISES), int), np.ones(TURNING, int)  # steps of each
     with bar(steps, "step") as progress:
         for k in range(steps):
             rate = min(1, (k + 1) / RAMP) * (0.02 + 0.49 * (1 + np.cos(np.pi * k / steps)))
             ends = tuple(jnp.asarray(each <= 1) for each in left)
             state, held, terms = hold_step(
-                state, held, source, ends, jnp.float32(rate), step_settings, holding
+                state, held, source, ends, jnp.float32(rate), step_settings
             )
             for each in left:
                 each -= 1
@@ -180,7 +170,7 @@ def train_and_hold(
                 short = rng.random() < SHORTER
                 left[0][place] = LONGEST ** rng.random() + 1 if short else LONGEST
             for place in np.flatnonzero(left[1] == 0):
-                left[1][place] = rng.uniform(*holding.turns)
+                left[1][place] = rng.uniform(*TURNS)
             share = 1 - min(DECAY, (k + 1) / (k + 20))
             average = jax.tree.map(lambda a, p: a + share * (p - a), average, state.params)  # noqa: B023
             progress.update()

@@ -169,13 +169,13 @@ def test_a_stage_at_rest_trains_what_has_a_memory_and_nothing_else(tmp_path, mon
 def test_a_stage_that_holds_trains_all_parts(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(EXPERIMENTS)
     holding = importlib.import_module("holding")
-    small = holding.Holding(turning=1, cut=16)
+    monkeypatch.setattr(holding, "CUT", 16)
     settings = Train(
         tmp_path, textures=4, batch=2, crop=20, windows=2, chain=2, warmup=0,
         loss=Loss(nlpd=0, haarpsi=0, lambda_tc=0, l0=1),
         scene=SceneSettings(objects=0), optimiser="centred",
     )  # fmt: skip
-    made = holding.train_and_hold(WEIGHTS, settings, tmp_path / "made.npz", 3, small)
+    made = holding.train_and_hold(WEIGHTS, settings, tmp_path / "made.npz", steps=3)
     before, after = fj.load_weights(WEIGHTS).params, fj.load_weights(made).params
     for name in before:
         pairs = zip(*map(jax.tree.leaves, (before[name], after[name])), strict=True)
@@ -189,7 +189,7 @@ def test_what_goes_to_and_fro_is_held_to_its_first_round(monkeypatch):
     rng = np.random.default_rng(0)
     tensors = rng.normal(size=(3, 2, 4, 4, 5)).astype(np.float32)
     back, forth = rng.random((2, 3, 2, 4, 4)).astype(np.float32)
-    held = holding.nothing_held(3, holding.Holding())._replace(
+    held = holding.nothing_held(3)._replace(
         tensors=tensors, first=(back, forth), passes=np.array([4, 7])
     )
     given, wanted = holding.next_pass(held)

@@ -232,13 +232,20 @@ def write_sequences(
             progress.set_postfix_str(
                 f"{in_words(mean)} each, {in_words(mean * len(work))} in all", refresh=False
             )
-    held = "" if split["validation"] else " (training holds out one in twenty, at least one)"
     print(
-        f"{settings.output}: {counted(split['train'], 'sequence')} for training and "
-        f"{split['validation']} for validation{held}, {settings.seconds:g} s each at "
+        f"{settings.output}: {in_parts(split)}, {settings.seconds:g} s each at "
         f"{width}x{height}; new: {len(missing)}, {events:,} events, {in_words(used)}"
     )
     return [path for path, *_ in work]
+
+
+def in_parts(split: dict[str, int]) -> str:
+    """ "40 sequences for training and 2 for validation" """
+    held = "" if split["validation"] else " (training holds out one in twenty, at least one)"
+    return (
+        f"{counted(split['train'], 'sequence')} for training and {split['validation']} for "
+        f"validation{held}"
+    )
 
 
 @lru_cache(maxsize=1)
