@@ -10,7 +10,7 @@ import pytest
 
 from firenet_jax.readers import open_recording
 from firenet_jax.storage import progress
-from firenet_jax.storage.progress import Bytes, bar
+from firenet_jax.storage.progress import Bytes, bar, first_done
 
 
 def test_a_line_a_minute_without_a_terminal(capsys, monkeypatch):
@@ -25,6 +25,22 @@ def test_a_line_a_minute_without_a_terminal(capsys, monkeypatch):
     assert len(lines) == 2
     assert re.match("firenet: 25 %, 01:05 passed, 03:1[45] left", lines[0])  # 195 s
     assert re.match("firenet: 50 %, 02:10 passed, 02:(10|09) left", lines[1])
+
+
+def test_the_first_may_say_nothing_of_the_others(capsys, monkeypatch):
+    now = 0.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    monkeypatch.setattr("tqdm.std.time", lambda: now)
+    with bar(101, "step") as shown:
+        now += 75.0
+        first_done(shown)
+        for _ in range(25):
+            now += 3.0
+            shown.update()
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.match(r"firenet: 21 %, 01:00 passed, 04:00 left, +3.00s/step", line)
+    with bar(10, "ev", quiet=True) as shown:
+        first_done(shown)
 
 
 def test_a_short_run_says_nothing(capsys):

@@ -44,6 +44,13 @@ def bar(total: float | None, unit: str, quiet: bool = False, **choices) -> tqdm:
     return kind(total=total, unit=unit, disable=quiet, **choices)
 
 
+def first_done(progress: tqdm) -> None:
+    """Counts the first of many, whose time, as of compiling, says nothing of the time left."""
+    progress.n += 1
+    progress.initial = progress.last_print_n = progress.n
+    progress.unpause()
+
+
 class Bytes:
     """How far this process has read some files, whatever library reads them: from the positions of
     open files, which Linux tells; elsewhere `total` is None."""

@@ -36,7 +36,7 @@ from firenet_jax.simulation.sensor import Simulation
 from firenet_jax.simulation.textures import load_textures, pictures_in
 from firenet_jax.storage import runs
 from firenet_jax.storage.files import locked, write_text
-from firenet_jax.storage.progress import bar
+from firenet_jax.storage.progress import bar, first_done
 from firenet_jax.training.batches import NO_AUGMENT, batches, find, split
 from firenet_jax.training.log import Log
 from firenet_jax.training.settings import Train
@@ -83,7 +83,7 @@ def run(
             going_on = "its %d steps are done" if state.step >= settings.steps else None
             logger.warning(f"%s: {going_on or 'going on after step %d'}", folder, state.step)
         prepare()
-        done = int(state.step)
+        done = begun = int(state.step)
         sources, validation = sources_of(settings, done)
         _keep_settings(folder, settings)  # only now, so that a failed start leaves no run behind
         log = Log(folder, done)
@@ -97,7 +97,7 @@ def run(
             while done < last and not interrupted:
                 state, terms = train_step(state, next(sources), settings.step_settings)
                 done += 1
-                progress.update()
+                first_done(progress) if done == begun + 1 else progress.update()
                 if done % settings.log_every == 0 or done == last:
                     terms = log.write(done, "train", terms)
                     progress.set_postfix(loss=f"{terms['loss']:.3f}", refresh=False)
