@@ -131,7 +131,7 @@ def sentence(error: Exception, command: str) -> str | None:
             extra = command if command in EXTRAS.values() else EXTRAS[library]
             return (
                 f"firenet {command} needs {library}, which is not installed: "
-                f'pip install "firenet-jax[{extra}]"'
+                f'in the source folder, pip install ".[{extra}]"'
             )
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
         return "not enough memory: ask for a smaller sensor, chunk, crop, pad or batch"

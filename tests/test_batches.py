@@ -404,7 +404,7 @@ def test_a_compression_that_h5py_lacks_is_said(noise, monkeypatch):
     """As for recordings: with hdf5plugin it is read, without it is named."""
     monkeypatch.setattr(h5py.h5z, "filter_avail", lambda number: False)
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
-    assert 'hdf5plugin: pip install "firenet-jax[formats]"' in refused(noise[0])
+    assert 'hdf5plugin: in the source folder, pip install ".[formats]"' in refused(noise[0])
 
 
 def test_pictures_and_flow_of_other_sizes_are_said(tmp_path):

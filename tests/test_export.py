@@ -330,4 +330,6 @@ def test_a_library_that_is_missing_is_named(here, capsys, monkeypatch, kind, lib
     monkeypatch.setitem(sys.modules, library, None)
     code, _, error = firenet(capsys, f"export -o model.{kind}")
     assert code == 1 and error.count("\n") == 1
-    assert f"the library {library.partition('.')[0]}, " in error and "firenet-jax[export]" in error
+    assert (
+        f"the library {library.partition('.')[0]}, " in error and 'pip install ".[export]"' in error
+    )

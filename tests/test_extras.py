@@ -50,7 +50,7 @@ def test_a_command_that_lacks_an_extra_says_which(line, extra):
     said = ended.stderr.splitlines()
     assert ended.returncode == 1 and len(said) == 1, ended.stderr
     assert said[0].startswith(f"firenet: error: firenet {line.split()[0]} needs ")
-    assert said[0].endswith(f'not installed: pip install "firenet-jax[{extra}]"')
+    assert said[0].endswith(f'not installed: in the source folder, pip install ".[{extra}]"')
 
 
 def test_each_library_is_in_the_extra_that_the_sentence_names():

@@ -166,7 +166,7 @@ def test_frames_of_other_kinds():
 def test_missing_extra(tmp_path, monkeypatch, name, package):
     without(monkeypatch, package)
     path = write(tmp_path / name, "% evt 3.0\n")
-    refused(path, package, 'pip install "firenet-jax[formats]"')
+    refused(path, package, 'in the source folder, pip install ".[formats]"')
 
 
 # ---------------------------------------------------------------- text
@@ -557,7 +557,7 @@ def test_hdf5_without_its_compression(tmp_path, monkeypatch):
     check(tmp_path / "events.h5")
     without(monkeypatch, "hdf5plugin")
     monkeypatch.setattr(h5py.h5z, "filter_avail", lambda number: False)
-    refused(tmp_path / "events.h5", "hdf5plugin", 'pip install "firenet-jax[formats]"')
+    refused(tmp_path / "events.h5", "hdf5plugin", 'in the source folder, pip install ".[formats]"')
 
 
 @pytest.mark.parametrize("number, name", [(36559, "Metavision's ECF"), (40001, "filter 40001")])

@@ -15,5 +15,5 @@ def missing(library: str) -> OutputError:
     """The error of a library that is not installed."""
     return OutputError(
         f"this kind of file is written by the library {library}, which is not installed: "
-        'pip install "firenet-jax[export]"'
+        'in the source folder, pip install ".[export]"'
     )

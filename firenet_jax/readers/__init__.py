@@ -336,7 +336,7 @@ def extra(module: str, path: Path) -> ModuleType:
     except ImportError as error:
         raise RecordingError(
             f"{path}: reading this format needs {module.split('.')[0]}: "
-            'pip install "firenet-jax[formats]"'
+            'in the source folder, pip install ".[formats]"'
         ) from error
 
 

@@ -50,7 +50,8 @@ class BagWriter:
             types = importlib.import_module("rosbags.typesys")
         except ImportError as error:
             raise OutputError(
-                f'{path}: writing bags needs rosbags: pip install "firenet-jax[formats]"'
+                f"{path}: writing bags needs rosbags: in the source folder, "
+                'pip install ".[formats]"'
             ) from error
         stores = types.Stores
         self.types = types.get_typestore(stores.ROS2_HUMBLE if self.ros2 else stores.ROS1_NOETIC)
