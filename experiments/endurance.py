@@ -234,7 +234,8 @@ def _scored(
     wanted: float,
     longest: float = math.inf,
 ) -> dict[str, list[dict]]:
-    """Scores of the last windows of sequences in which `wanted` events per pixel make a window.
+    """Scores of the last windows of sequences in which `wanted` events per pixel make a window, and
+    by how many pixels the fastest point moves in one.
 
     longest: microseconds of a window at most.
     """
@@ -250,13 +251,15 @@ def _scored(
         rate = _rates(sensors, scenes, durations, 400, **SIZE)
         most = jnp.minimum(1e6 * PIXELS / scenes.speed, longest)
         durations = jnp.clip(durations * wanted / jnp.maximum(rate, 1e-6), 200, most)
+        moved = np.asarray(1e-6 * durations * scenes.speed)
         bounds = window_bounds(durations.astype(jnp.int32), windows)
         data = simulate(sensors, scenes, bounds, renderings=round(PIXELS), **SIZE)[1]
         truths = np.asarray(data.images[WARM:])
         for name, weights in methods.items():
             state = initial_state(BATCH, *SIZE.values())
             images = np.asarray(reconstruct(weights, state, data.tensors)[1])
-            found[name] += scores(images[WARM:], truths, equalised=True)
+            rows = scores(images[WARM:], truths, equalised=True)
+            found[name] += [row | {"pixels": float(p)} for row, p in zip(rows, moved, strict=True)]
     return found
 
 
