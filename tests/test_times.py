@@ -45,6 +45,8 @@ def read(tmp_path, recording, text, **choices):
         "#timestamp [ns],filename\n5250000000,a.png\n5500000000,b.png\n6000001000,c.png\n",
         "index,time_us,events\n0,5250000,7\n1,5500000,8\n2,6000001,9\n",
         "# index time_us events\n0 5250000 7\n1 5500000 8\n2 6000001 9\n",
+        '"stamps","file1"\n5.25,"a"\n5.5,"b"\n6.000001,"c"\n',
+        "t0\n5.25\n5.5\n6.000001\n",
         "5.25 images/a.png\n5.5 images/b.png\n6.000001 images/c.png\n",
         "\ufefft\n5.25e6\n5.5e6\n6.000001e6\n",
     ],

@@ -25,7 +25,8 @@ UNITS = {"s": 10**6, "ms": 10**3, "us": 1, "ns": Decimal("0.001")}  # microsecon
 UNIT_OF = {name: names[0] for names in text.UNITS.values() for name in names}
 UNIT_NAMES = {names[0]: names[-1] for names in text.UNITS.values()}  # "ms": "milliseconds"
 COLUMN = re.compile(r"t|time|timestamps?|stamps?")  # without its unit
-NAME = re.compile(r"(?<![\w.:+-])(?!nan|inf)[a-z_]+(?:[\s,;\[(]|$)")  # in a header line
+# Of a column, in a header line.
+NAME = re.compile(r"""(?<![\w.:+-])(?!(?:nan|inf)\b)[a-z_][a-z_0-9]*(?:[\s,;:\[("']|$)""")
 NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-zµμ]*)", re.IGNORECASE)
 SPLIT = re.compile(r"[\s,;]+")
 LARGEST = 1 << 28  # bytes of a file of times
