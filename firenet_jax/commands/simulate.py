@@ -126,11 +126,7 @@ class Simulate:
         share(self.process, self.processes)
         check_idle(with_faults(self.sensor) if self.faults else self.sensor)
         if self.video is not None:
-            plain = [name for name in OF_SCENES if name != "scene"]
-            idle = [name for name in plain if getattr(self, name) != getattr(Simulate, name)]
-            scene = vars(self.scene).items()
-            idle += [name for name, value in scene if value != getattr(SceneSettings, name)]
-            check_none_idle(idle, "turning a video into events")
+            check_none_idle(self, OF_SCENES, "turning a video into events")
             if self.sensor.flicker is not None:
                 raise SettingsError(
                     "flicker: pictures of a video are too far apart to show it: leave it out"

@@ -44,8 +44,11 @@ def bar(total: float | None, unit: str, quiet: bool = False, **choices) -> tqdm:
     return kind(total=total, unit=unit, disable=quiet, **choices)
 
 
-def first_done(progress: tqdm) -> None:
-    """Counts the first of many, whose time, as of compiling, says nothing of the time left."""
+def one_done(progress: tqdm, first: bool) -> None:
+    """Counts one; the time of the first, as of compiling, says nothing of the time left."""
+    if not first:
+        progress.update()
+        return
     progress.n += 1
     progress.initial = progress.last_print_n = progress.n
     progress.unpause()

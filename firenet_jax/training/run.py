@@ -36,7 +36,7 @@ from firenet_jax.simulation.sensor import Simulation
 from firenet_jax.simulation.textures import load_textures, pictures_in
 from firenet_jax.storage import runs
 from firenet_jax.storage.files import locked, write_text
-from firenet_jax.storage.progress import bar, first_done
+from firenet_jax.storage.progress import bar, one_done
 from firenet_jax.training.batches import NO_AUGMENT, batches, find, split
 from firenet_jax.training.log import Log
 from firenet_jax.training.settings import Train
@@ -80,8 +80,7 @@ def run(
     ):
         if saved.latest_step() is not None:
             state = restored(saved, state)
-            going_on = "its %d steps are done" if state.step >= settings.steps else None
-            logger.warning(f"%s: {going_on or 'going on after step %d'}", folder, state.step)
+            _say_how_far(folder, int(state.step), settings.steps)
         prepare()
         done = begun = int(state.step)
         sources, validation = sources_of(settings, done)
@@ -97,7 +96,7 @@ def run(
             while done < last and not interrupted:
                 state, terms = train_step(state, next(sources), settings.step_settings)
                 done += 1
-                first_done(progress) if done == begun + 1 else progress.update()
+                one_done(progress, first=done == begun + 1)
                 if done % settings.log_every == 0 or done == last:
                     terms = log.write(done, "train", terms)
                     progress.set_postfix(loss=f"{terms['loss']:.3f}", refresh=False)
@@ -114,6 +113,11 @@ def run(
         raise KeyboardInterrupt(f"step {done} is saved: the same command goes on from there")
     if is_first():
         print(f"{folder / 'weights.npz'}: best validation loss {best:.4f} in {done} steps")
+
+
+def _say_how_far(folder: Path, done: int, steps: int) -> None:
+    said = f"going on after step {done}" if done < steps else f"its {done} steps are done"
+    logger.warning("%s: %s", folder, said)
 
 
 def restored(saved: ocp.CheckpointManager, state: Any) -> Any:

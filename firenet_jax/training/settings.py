@@ -181,16 +181,10 @@ class Train:
 
 def _check_idle(settings: Train) -> None:
     """Raises SettingsError for what would have no effect on this kind of data."""
-    names = []
-    for name in SIMULATED if settings.data else ("augment",):
-        now, default = getattr(settings, name), getattr(Train, name)
-        if dataclasses.is_dataclass(default):
-            inner = (field.name for field in dataclasses.fields(default))
-            names += [n for n in inner if getattr(now, n) != getattr(default, n)]
-        elif now != default:
-            names.append(name)
-    kind = "sequences from --data" if settings.data else "simulated sequences"
-    check_none_idle(names, f"training on {kind}")
+    if settings.data:
+        check_none_idle(settings, SIMULATED, "training on sequences from --data")
+    else:
+        check_none_idle(settings, ["augment"], "training on simulated sequences")
 
 
 def _check_step(settings: Train) -> None:

@@ -107,7 +107,10 @@ function npy(bytes, name) {
   const type = /'descr': '[<|]([fiub][1248])'/.exec(head)?.[1];
   const fields = [...head.matchAll(/\('([^']*)', '[<|]([fiubV])(\d+)'\)/g)];
   const shape = /'shape': \(([^)]*)\)/.exec(head)?.[1].split(",").filter((s) => s.trim()).map(Number);
-  if (shape?.length === 1 && fields.length) return structured(bytes.slice(start), fields, shape[0]);
+  const row = fields.reduce((sum, [, , , size]) => sum + Number(size), 0) || Number(type?.[1]);
+  if (shape && bytes.length < start + row * shape.reduce((a, b) => a * b, 1))
+    throw new Error(`${name}: is cut short`);
+  if (shape?.length === 1 && fields.length) return structured(bytes.slice(start), fields, row, shape[0]);
   if (!KINDS[type] || !shape) throw new Error(`${name}: expected an array of numbers`);
   const data = numbers(bytes.slice(start), type);
   return { data, shape, whole: type[0] !== "f", fortran: /'fortran_order': True/.test(head) };
@@ -120,8 +123,7 @@ function numbers(bytes, type) {
 }
 
 /** Rows of fields -> {name: {data, whole}}, of fields of other kinds none. */
-function structured(bytes, fields, rows) {
-  const row = fields.reduce((sum, [, , , size]) => sum + Number(size), 0);
+function structured(bytes, fields, row, rows) {
   const found = {};
   let offset = 0;
   for (const [, name, kind, size] of fields) {
