@@ -1,5 +1,6 @@
 import json
 import math
+import os
 import sys
 from fractions import Fraction
 from pathlib import Path
@@ -14,7 +15,7 @@ from PIL import Image
 from firenet_jax import cli
 from firenet_jax.commands import simulate as dataset
 from firenet_jax.commands.simulate import Simulate, rounded_flow, run
-from firenet_jax.errors import OutputError, PictureError
+from firenet_jax.errors import OutputError, PictureError, SettingsError
 from firenet_jax.events import Events, concatenate
 from firenet_jax.readers import open_recording
 from firenet_jax.simulation.clip import read_clip
@@ -23,7 +24,7 @@ from firenet_jax.simulation.sensor import EPS, SensorSettings, random_sensor
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage import files, sequence_file
 from firenet_jax.storage.arrays import ArraysWriter
-from firenet_jax.storage.files import locked
+from firenet_jax.storage.files import locked, open_alone
 from firenet_jax.storage.runs import alone_in
 from firenet_jax.storage.sequence_file import Picture, write_sequence
 from firenet_jax.storage.video import VideoWriter, write_video
@@ -315,6 +316,31 @@ def test_what_another_run_is_writing_is_left_alone(tmp_path):
     assert partial.read_bytes() == b"half of it"
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
+def test_runs_of_other_numbers_of_processes_do_not_take_each_others_files(tmp_path):
+    """One of two and one alone; one of two and one of three, which want the same sequence."""
+    run(settings(tmp_path, sequences=1, validation=0))
+    shared = settings(tmp_path, sequences=2, validation=0, processes=2, process=1)
+    partial = tmp_path / "train" / "000001.partial.h5"
+    with open_alone(partial, tmp_path / "train" / "000001.h5") as opened:
+        opened.write(b"half of it")
+        with locked(tmp_path, shared=True):
+            with pytest.raises(OutputError, match="another run is writing it"):
+                run(settings(tmp_path, sequences=2, validation=0))
+            with pytest.raises(OutputError, match="000001.h5: another run is writing it"):
+                run(shared)
+        assert partial.read_bytes() == b"half of it"
+        with locked(tmp_path), pytest.raises(OutputError, match="another run is writing it"):
+            run(shared)
+    run(shared)
+    assert not partial.exists() and (tmp_path / "train" / "000001.h5").exists()
+
+
+def test_overwrite_is_of_a_video():
+    with pytest.raises(SettingsError, match="overwrite: no part in simulating scenes"):
+        Simulate(Path("set"), overwrite=True)
+
+
 def test_partial_files_elsewhere_in_a_folder_are_left_alone(tmp_path):
     run(settings(tmp_path, sequences=1, validation=0))
     (tmp_path / "mine").mkdir()
@@ -455,9 +481,18 @@ def test_clips_of_common_formats_reach_from_black_to_white(tmp_path, suffix):
 
 
 @pytest.mark.parametrize(
-    "matrix, turns", [((0, 1, -1, 0), -1), ((-1, 0, 0, -1), 2), ((0, -1, 1, 0), 1)]
+    "matrix, shown",
+    [
+        ((0, 1, -1, 0), lambda stored: np.rot90(stored, -1)),
+        ((-1, 0, 0, -1), lambda stored: np.rot90(stored, 2)),
+        ((0, -1, 1, 0), np.rot90),
+        ((-1, 0, 0, 1), np.fliplr),  # of its front camera
+        ((1, 0, 0, -1), np.flipud),
+        ((0, 1, 1, 0), np.transpose),
+        ((0, -1, -1, 0), lambda stored: np.rot90(stored.T, 2)),
+    ],
 )
-def test_clips_of_a_telephone_are_upright(tmp_path, matrix, turns):
+def test_clips_of_a_telephone_are_upright(tmp_path, matrix, shown):
     """It writes what its sensor sees, and how a player should rotate it (ISO 14496-12, tkhd)."""
     clip = tmp_path / "a.mp4"
     ramp = np.add.outer(5 * np.arange(32), np.arange(64)).astype(np.uint8)
@@ -470,7 +505,7 @@ def test_clips_of_a_telephone_are_upright(tmp_path, matrix, turns):
     data[start : start + 36] = rows
     clip.write_bytes(data)
     first, _ = (picture.image for picture in read_clip(clip))
-    expected = np.rot90(ramp, turns)
+    expected = shown(ramp)
     assert first.shape == expected.shape
     assert np.abs(first.astype(int) - expected).max() <= 6
     small, _ = (picture.image for picture in read_clip(clip, (20, 12)))
@@ -597,6 +632,41 @@ def test_number_of_pictures_follows_the_duration(tmp_path):
     )
     times = [picture.time for picture in pictures]
     assert len(times) == math.floor(0.25 * 30) + 1 and times[:2] == [0, 33_333]
+
+
+def test_a_clip_that_is_cut_short_is_said(tmp_path, caplog):
+    clip, out = tmp_path / "a.mkv", tmp_path / "a.h5"
+    ramp(clip, count=40)
+    line = f"simulate --video {clip} -o {out} --overwrite".split()
+    assert cli.main(line) == 0 and not caplog.text
+    clip.write_bytes(clip.read_bytes()[: clip.stat().st_size // 2])
+    assert cli.main(line) == 0
+    assert "but it says that it lasts" in caplog.text and str(clip) in caplog.text
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no named pipes")
+def test_a_clip_from_a_pipe_or_in_place_of_the_output_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "a.mkv")
+    with pytest.raises(PictureError, match="is a pipe or device"):
+        run(Simulate(tmp_path / "a.h5", video=tmp_path / "a.mkv"))
+    clip = tmp_path / "b.mkv"
+    ramp(clip, count=3)
+    clip.rename(tmp_path / "b.h5")
+    with pytest.raises(OutputError, match="is a recording that is read"):
+        run(Simulate(tmp_path / "b.h5", video=tmp_path / "b.h5", overwrite=True))
+
+
+def test_noise_does_not_depend_on_the_rate_of_a_clip(tmp_path):
+    """Ten events a second of each pixel in the dark: of five pictures, and of 50."""
+    counts = []
+    for fps in (5, 50):
+        clip, out = tmp_path / f"{fps}.mp4", tmp_path / f"{fps}.h5"
+        write_video(clip, [np.zeros((HEIGHT, WIDTH), np.uint8)] * (2 * fps + 1), fps=fps)
+        sensor = SensorSettings(noise=(10.0, 10.0))
+        run(Simulate(out, video=clip, sensor=sensor))
+        counts.append(sum(map(len, open_recording(out).events())))
+    expected = 2 * 10 * HEIGHT * WIDTH
+    assert np.abs(np.array(counts) - expected).max() < 4 * np.sqrt(expected)
 
 
 def test_training_and_validation_choose_from_other_textures(tmp_path, monkeypatch):

@@ -136,12 +136,27 @@ def test_textures_are_blurred_for_the_scale_at_which_they_are_seen():
     """White noise: next to nothing may be left of what would alias, much of what would not."""
     noise = np.random.default_rng(1).random((64, 64)).astype(np.float32)
     density = 2.0  # texture pixels for one of the image, which then holds up to 0.25 cycles each
-    blurred = np.asarray(jax.jit(module._blurred)(noise, 0.6 * density))
+    blurred = np.asarray(jax.jit(partial(module._blurred, reach=4))(noise, 0.6 * density))
     spectrum, before = (np.abs(np.fft.fft2(image - 0.5)) ** 2 for image in (blurred, noise))
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(64), np.fft.fftfreq(64)))
     aliasing, kept = frequency > 0.35, frequency < 0.1
     assert spectrum[aliasing].sum() < 0.01 * before[aliasing].sum()
     assert spectrum[kept].sum() > 0.6 * before[kept].sum()
+
+
+@pytest.mark.parametrize("choice", [{"blur": (2.0, 2.0)}, {"zoom": (0.1, 0.1)}])
+def test_wide_blurs_are_as_wide_as_said(choice):
+    """What a point of the background becomes: its standard deviation, where it is seen at rest."""
+    settings = SceneSettings(objects=0, tilt=0.0, **choice)
+    point = np.zeros((1, 129, 129), np.float32)
+    point[0, 64, 64] = 1.0
+    scene = module.random_scene(jax.random.key(4), point, settings=settings, **SIZE)
+    spread = np.asarray(scene.textures[0] - scene.textures[0].min()).sum(0)
+    place = np.arange(129) - 64
+    texture_pixels = np.sqrt((spread * place**2).sum() / spread.sum())
+    zoom = 1 / float(scene.density[0])  # at a distance of 1
+    wanted = np.sqrt((settings.blur[0] * 1.2 / zoom) ** 2 - 0.16)
+    assert abs(texture_pixels / wanted - 1) < 0.05
 
 
 @pytest.mark.slow
@@ -356,7 +371,8 @@ def test_a_shaking_camera_comes_back_again_and_again():
         assert 0.3 < np.abs(away).max() < 2 * 1.3  # nearer than at rest it looks larger
         turns = (np.diff(np.sign(np.diff(away[:, 0]))) != 0).sum()
         assert turns >= 4 * DURATION
-        assert float(speeds(scene, times, **SIZE).max()) <= float(scene.speed) <= SPEEDS[1] * 1.001
+        often = np.linspace(0.0, DURATION, 6000, dtype=np.float32)
+        assert float(speeds(scene, often, **SIZE).max()) <= float(scene.speed) <= SPEEDS[1] * 1.001
         if float(scene.camera.pace) == 0:
             assert np.ptp(rest, 0).max() < 1e-4
             stood += 1
@@ -417,6 +433,8 @@ def test_video_gives_each_time_its_picture(scenes):
         ({"shake": -0.1}, "a probability"), ({"shake_pixels": (0.0, 1.0)}, "shake_pixels is 0 1"),
         ({"blur": (0.0, 0.5)}, "more than 0"),
         ({"shake_pixels": (1.0, 2.0)}, "--shake-pixels says more of --shake"),
+        ({"blur": (5.0, 5.0)}, "one of 13.3 texture pixels, but at most 8"),
+        ({"objects": 0, "plain": 0.5, "still": 0.1}, "still, plain: no part in scenes without"),
         ({"objects": -1}, "objects is -1"), ({"tilt": -0.1}, "tilt"),
         ({"white": (0.9, 2.0)}, "white is 0.9 2"),
     ],

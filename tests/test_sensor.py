@@ -323,6 +323,8 @@ def test_faults_are_switched_on_but_what_is_given_stays():
         ({"cutoff": (1.0, np.nan)}, "cutoff"), ({"threshold_range": (0.0, 1.0)}, "threshold_range"),
         ({"flicker": (0.5, 1.5)}, "light is not negative"),
         ({"flicker": (0.0, 0.5)}, "flicker is 0 0.5"),
+        ({"threshold": 0.005}, "a threshold of 0.005, but at least 0.01"),
+        ({"threshold_range": (0.001, 0.2)}, "a threshold of 0.001, but at least 0.01"),
         ({"threshold": -1.0}, "threshold is -1"), ({"refractory": -1.0}, "refractory is -1"),
         ({"mismatch": np.nan}, "mismatch"),
         ({"threshold": 0.3, "threshold_range": (0.1, 0.6)}, "--threshold-range VALUE VALUE"),
@@ -513,6 +515,34 @@ def test_shot_noise_has_its_rate_and_no_order():
         place = np.asarray(run.first)[fired > 0] / (1000 * TICKS)
         spread = np.histogram(place, 5, (0, 1))[0]  # histogram leaves out what is outside
         assert spread.sum() == fired.sum() and spread.std() <= 0.1 * spread.mean()
+
+
+@pytest.mark.parametrize(
+    "noise_in_light, light, rate", [(None, 0.0, 20.0), ((5.0, 5.0), 1.0, 100.0)]
+)
+def test_shot_noise_has_its_rate_however_far_apart_renderings_are(noise_in_light, light, rate):
+    """Half a second: ten events of a pixel between two, or fifty in full light."""
+    sensor = with_only(4, noise=(20.0, 20.0), noise_in_light=noise_in_light)
+    times = np.arange(0, 2_000_001, 500_000)
+    images = np.full((len(times), H, W), light, np.float32)
+    events = concatenate(list(event_list(sensor, zip(times, images, strict=True))))
+    expected = 2 * rate * H * W
+    assert abs(len(events) - expected) < 4 * np.sqrt(expected)
+    assert (np.diff(events.t) >= 0).all() and events.t[-1] <= 2_000_000
+
+
+def test_renderings_between_are_on_the_line_of_log_intensity():
+    """So events that are no noise stay as they are without it, to a microsecond."""
+    rng = np.random.default_rng(3)
+    images = rng.uniform(0.1, 1, (3, H, W)).astype(np.float32)
+    times = np.array([0, 400_000, 800_000])
+    noisy = noisy_sensor(0.0)._replace(noise=jnp.array([20.0, 0.25, 0.0]))
+    dense = list(module._dense(noisy, zip(times, images, strict=True)))
+    assert len(dense) == 1 + 2 * 16 and [t for t, _ in dense[::16]] == times.tolist()
+    logs = np.log(EPS + np.stack([image for _, image in dense]))
+    expected = np.stack([np.interp(np.arange(33), (0, 16, 32), each) for each in
+                         np.log(EPS + images).reshape(3, -1).T], 1).reshape(33, H, W)  # fmt: skip
+    np.testing.assert_allclose(logs, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(

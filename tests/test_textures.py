@@ -121,3 +121,18 @@ def test_pictures_to_judge_by_are_in_no_pool(tmp_path):
     (tmp_path / "mine.png").unlink()
     with pytest.raises(ValueError, match="holds no pictures .* but .*, which is held out"):
         load_textures(tmp_path, count=1, size=64)
+
+
+def test_a_damaged_tiff_is_not_used(tmp_path, caplog):
+    """Pillow meets bytes where it expects a number, and raises a TypeError."""
+    rng = np.random.default_rng(1)
+    for name in ("bad.tif", "good.png"):
+        Image.fromarray(rng.integers(0, 256, (80, 80), dtype=np.uint8)).save(tmp_path / name)
+    data = bytearray((tmp_path / "bad.tif").read_bytes())
+    start = int.from_bytes(data[4:8], "little")
+    for entry in range(start + 2, start + 2 + 12 * data[start], 12):
+        if int.from_bytes(data[entry : entry + 2], "little") == 273:  # where its strips begin
+            data[entry + 2] = 7  # bytes of any kind
+    (tmp_path / "bad.tif").write_bytes(data)
+    assert load_textures(tmp_path, count=3, size=64).shape == (3, 64, 64)
+    assert f"not used: {tmp_path / 'bad.tif'}" in caplog.text

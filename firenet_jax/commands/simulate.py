@@ -24,7 +24,7 @@ from firenet_jax.devices import share
 from firenet_jax.errors import OutputError, PictureError, SettingsError
 from firenet_jax.events import Events, counted
 from firenet_jax.settings import check_none_idle, check_seed, parse_size
-from firenet_jax.simulation.clip import read_clip
+from firenet_jax.simulation.clip import read_clip, warn_if_cut
 from firenet_jax.simulation.scenes import (
     Scene,
     SceneSettings,
@@ -43,7 +43,13 @@ from firenet_jax.simulation.sensor import (
 )
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage import runs
-from firenet_jax.storage.files import partial_name, write_text
+from firenet_jax.storage.files import (
+    check_apart,
+    check_no_pipe,
+    partial_name,
+    remove_left,
+    write_text,
+)
 from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import bar
 from firenet_jax.storage.sequence_file import Picture, write_sequence
@@ -53,6 +59,7 @@ SEQUENCES_PER_POOL = 32  # sequences that share a pool of textures
 TEXTURES, TEXTURE_SIZE = 64, 320  # of a pool
 MIN_SAMPLE = 8  # sequences whose mean size is a fair estimate of all sizes
 LONGEST_SCENE = 60.0  # seconds; a scene's clock is float32, which by then ticks in 4 us
+MOST_FPS = 10_000  # with more pictures a second, rounding shows in the flow from one to the next
 PATIENCE = 600  # seconds that processes wait for the first one
 CLIP_SUFFIXES = (".h5", ".hdf5")
 # Settings that no sequence depends on.
@@ -86,8 +93,9 @@ class Simulate:
     sensor_size: str | None = None
     """WIDTHxHEIGHT (default: 240x180, or the size of the video)."""
     images: Path | None = None
-    """Folder of pictures for the textures (the paper used MS-COCO). Default: scikit-image's
-    photographs, if it is installed, and procedural textures."""
+    """Folder of pictures for the textures (the paper used MS-COCO), but for five names that are
+    held out to judge by, such as flower.jpg. Default: scikit-image's photographs, if it is
+    installed, and procedural textures."""
     seed: int = 0
     """Random seed."""
     video: Path | None = None
@@ -112,8 +120,8 @@ class Simulate:
                 f"seconds is {self.seconds}, but a sequence lasts more than 0 and up to "
                 f"{LONGEST_SCENE:g}: make more sequences instead"
             )
-        if not 0 < self.fps <= 1e5:
-            raise SettingsError(f"fps is {self.fps}, but must be more than 0 and up to 100000")
+        if not 0 < self.fps <= MOST_FPS:
+            raise SettingsError(f"fps is {self.fps}, but must be more than 0 and up to {MOST_FPS}")
         if self.sequences < 1:
             raise SettingsError(f"sequences is {self.sequences}, but must be 1 or more")
         if self.validation is not None and not 0 <= self.validation <= self.sequences:
@@ -131,6 +139,8 @@ class Simulate:
                 raise SettingsError(
                     "flicker: pictures of a video are too far apart to show it: leave it out"
                 )
+        else:
+            check_none_idle(self, ["overwrite"], "simulating scenes, where an earlier run goes on")
 
 
 # ---- Sequences
@@ -152,11 +162,11 @@ def run(settings: Simulate) -> list[Path]:
             return write_sequences(settings, height, width)
     if process:
         _wait_for(folder / "settings.json")
-    runs.make_folder(folder)
-    open_folder(settings)
     mine = folder / "running" / f"{process} of {processes}"
-    with runs.alone_in(mine):
-        written = write_sequences(settings, height, width, process, processes)
+    with runs.side_by_side_in(folder):
+        open_folder(settings)
+        with runs.alone_in(mine):
+            written = write_sequences(settings, height, width, process, processes)
     with contextlib.suppress(OSError):  # others are still there
         mine.rmdir()
         mine.parent.rmdir()
@@ -199,7 +209,7 @@ def write_sequences(
     own = [partial_name(path) for path, *_ in work]
     all_left = (path for name in split for path in (settings.output / name).glob("*.partial.h5"))
     for left in own if processes > 1 else all_left:
-        left.unlink(missing_ok=True)
+        remove_left(left)
     missing = [entry for entry in work if not entry[0].exists()]
     events = used = 0
     there = len(work) - len(missing)
@@ -362,6 +372,8 @@ def simulate_clip(settings: Simulate, clip: Path) -> Path:
     path = settings.output
     if path.suffix not in CLIP_SUFFIXES:
         raise OutputError(f"{path}: with --video the output is one file: name it {path}.h5")
+    check_no_pipe(clip, PictureError)
+    check_apart(path, [clip])
     if path.is_dir() or (path.exists() and not settings.overwrite):
         raise OutputError(f"{path} exists: choose another output or pass --overwrite")
     runs.make_folder(path.parent)
@@ -375,17 +387,20 @@ def simulate_clip(settings: Simulate, clip: Path) -> Path:
     sensor = with_faults(settings.sensor) if settings.faults else settings.sensor
     sides = {"height": height, "width": width}
     camera = random_sensor(jax.random.key(settings.seed), settings=sensor, **sides)
+    last = 0
 
     def renderings():
+        nonlocal last
         # The sensor takes log intensity as linear between two renderings: these are the pictures.
         with bar(None, "pictures") as progress:
             for picture in read_clip(clip, size):
-                yield picture.time, picture.image.astype(np.float32) / 255
+                yield (last := picture.time), picture.image.astype(np.float32) / 255
                 progress.update()
 
     record = {k: v for k, v in describe(settings).items() if k not in OF_SCENES}
     record |= {"video": clip.name, "sensor_size": f"{width}x{height}"}
     events = ahead(event_list(camera, renderings()), depth=4)
     count = write_sequence(path, events, read_clip(clip, size), settings=record, **sides)
+    warn_if_cut(clip, last)
     print(f"{path}: {count:,} events of {width}x{height} pixels")
     return path

@@ -8,10 +8,12 @@ import av
 import numpy as np
 from av.error import FFmpegError
 
-from firenet_jax.errors import PictureError
+from firenet_jax.errors import PictureError, logger
 from firenet_jax.simulation.sensor import MAX_INTERVAL
 from firenet_jax.storage.files import check_readable
 from firenet_jax.storage.sequence_file import Picture
+
+CUT = 5  # periods by which the last picture may come before the end that the file states
 
 
 def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Picture]:
@@ -43,13 +45,13 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
                         "convert the clip to a constant rate"
                     )
                 last = time
-                turns = frame.rotation // 90 % 4  # of a telephone held upright
-                stored = size[::-1] if size and turns % 2 else size  # before it is turned
+                matrix = _matrix(frame)
+                stored = size[::-1] if size and _lies(matrix) else size  # before it is turned
                 height, width = stored or (frame.height, frame.width)
                 # By way of RGB: the grey plane of a video does not reach from 0 to 255.
                 rgb = frame.to_ndarray(format="rgb24", width=width, height=height)
                 grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)
-                upright = np.rot90(np.round(grey).astype(np.uint8), turns)
+                upright = _upright(np.round(grey).astype(np.uint8), matrix)
                 shape = shape or upright.shape
                 if upright.shape != shape:
                     raise PictureError(
@@ -63,3 +65,42 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
         raise PictureError(
             f"{path}: cannot be read as a video ({reason}): name a file that ffmpeg can play"
         ) from error
+
+
+def _matrix(frame: av.VideoFrame) -> tuple[int, int, int, int]:
+    """(a, b, c, d): a pixel is to be shown at (a x + c y, b x + d y), as of a telephone held
+    upright, or its front camera."""
+    for data in frame.side_data:
+        if data.type.name == "DISPLAYMATRIX":
+            a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
+            return a, b, c, d
+    return 1, 0, 0, 1
+
+
+def _lies(matrix: tuple[int, int, int, int]) -> bool:
+    return abs(matrix[1]) > abs(matrix[0])
+
+
+def _upright(picture: np.ndarray, matrix: tuple[int, int, int, int]) -> np.ndarray:
+    """(H, W) as stored -> as it is to be shown, to the nearest quarter turn."""
+    a, b, c, d = matrix
+    if _lies(matrix):
+        picture, a, d = picture.T, c, b
+    return picture[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
+
+
+def warn_if_cut(path: Path, last: int) -> None:
+    """Says where a file that can be read states that it lasts longer; last: microseconds from the
+    first picture to the last."""
+    with av.open(str(path.absolute()), metadata_errors="replace") as container:
+        stream = container.streams.video[0]
+        period, stated = 1 / (stream.average_rate or Fraction(25)), None
+        if stream.duration is not None and stream.time_base is not None:
+            stated = stream.duration * stream.time_base
+        elif container.duration is not None and len(container.streams) == 1:  # sound lasts longer
+            stated = Fraction(container.duration, av.time_base)
+    if stated is not None and stated - Fraction(last, 10**6) > CUT * period:
+        logger.warning(
+            "%s: its last picture comes after %.2f s, but it says that it lasts %.2f: is it whole?",
+            path, last / 1e6, stated,
+        )  # fmt: skip

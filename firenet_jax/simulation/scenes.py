@@ -23,14 +23,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.errors import SettingsError
-from firenet_jax.settings import check_range
+from firenet_jax.settings import check_none_idle, check_range
 from firenet_jax.warp import sample
 
 WAVES = 3  # sinusoids in each of the six coordinates of a motion
 PAUSES = 2  # greatest number of stops in a scene
 OUTLINE = 96  # cells on a side of an object's outline
 MARGIN = 1.3  # the outline's field reaches so many radii from the centre
-BLUR = 4  # pixels of the blurring kernel on each side of its middle
+MOST_BLUR = 8.0  # texture pixels, standard deviation: wider kernels take long to compile
+OF_OBJECTS = "still", "plain", "size", "softness"  # settings that say more of them
+
+
+def _variance(blur, zoom):
+    """Of the blur of textures, in texture pixels, squared, for one of so many image pixels.
+
+    Half an image pixel keeps the picture free of aliasing; planes are seen up to a fifth farther
+    away than at rest, and looking up bilinearly already blurs by 0.4 texture pixels.
+    """
+    return (blur * 1.2 / zoom) ** 2 - 0.4**2
 
 
 @dataclass(frozen=True)
@@ -86,12 +96,20 @@ class SceneSettings:
                 raise SettingsError(
                     f"{name} is {getattr(self, name)}, but is a probability, 0 to 1"
                 )
+        if (widest := self.widest_blur) > MOST_BLUR:
+            raise SettingsError(
+                f"a blur of {self.blur[1]:g} image pixels at a zoom of {self.zoom[0]:g} is one of "
+                f"{widest:.1f} texture pixels, but at most {MOST_BLUR:g}: ask for less --blur or a "
+                "greater --zoom"
+            )
         if self.shake_pixels != SceneSettings.shake_pixels and not self.shake:
             raise SettingsError(
                 "--shake-pixels says more of --shake, which is not asked for: pass that, too"
             )
         if self.objects < 0:
             raise SettingsError(f"objects is {self.objects}, but must be 0 or more")
+        if not self.objects:
+            check_none_idle(self, OF_OBJECTS, "scenes without --objects")
         if not 0 <= self.tilt <= 1:
             raise SettingsError(f"tilt is {self.tilt} radians, but must be between 0 and 1")
         for name in ("black", "white"):
@@ -101,6 +119,11 @@ class SceneSettings:
                     f"{name} is {least:g} {greatest:g}, but both are intensities, 0 to 1, "
                     "the least first"
                 )
+
+    @property
+    def widest_blur(self) -> float:
+        """The greatest standard deviation of a texture's blur, in its pixels."""
+        return math.sqrt(max(_variance(self.blur[1], self.zoom[0]), 0.01))
 
 
 class Motion(NamedTuple):
@@ -188,11 +211,11 @@ def random_scene(
     size = textures.shape[-1]
     chosen = textures[_whole(uniform((0.0, textures.shape[0]), (planes,)), textures.shape[0])]
     lit = _lit(light_key, chosen, settings)
-    # Half a pixel of blur keeps the picture free of aliasing; planes are seen up to a fifth farther
-    # away than at rest, and looking up bilinearly already blurs by 0.4 texture pixels.
     blur = _dice(jax.random.fold_in(key, 1), 1)[1](settings.blur)
-    sigma = jnp.sqrt(jnp.maximum((blur * 1.2 / zoom) ** 2 - 0.4**2, 1e-4))
-    canvases = jnp.clip(jax.vmap(_blurred)(lit, sigma), 0.0, 1.0)  # rounding may exceed 1
+    sigma = jnp.sqrt(jnp.maximum(_variance(blur, zoom), 1e-4))
+    reach = min(math.ceil(3 * settings.widest_blur), size - 1)
+    blurred = jax.vmap(partial(_blurred, reach=reach))(lit, sigma)
+    canvases = jnp.clip(blurred, 0.0, 1.0)  # rounding may exceed 1
     origin = (size - 1) / 2 + uniform((-0.15, 0.15), (planes, 2)) * size
 
     outlines = jax.vmap(_outline)(jax.random.split(outline_keys, settings.objects))
@@ -329,17 +352,18 @@ def _lit(key: jax.Array, textures: jax.Array, settings: SceneSettings) -> jax.Ar
     return lit * jnp.exp(-depth * shade)
 
 
-def _blurred(image: jax.Array, sigma: jax.Array) -> jax.Array:
-    """(S, S) -> the same under a Gaussian of this many pixels, mirrored at the border."""
-    distance = jnp.arange(-BLUR, BLUR + 1, dtype=jnp.float32)
+def _blurred(image: jax.Array, sigma: jax.Array, reach: int) -> jax.Array:
+    """(S, S) -> the same under a Gaussian of this many pixels, cut off `reach` pixels from its
+    middle, mirrored at the border."""
+    distance = jnp.arange(-reach, reach + 1, dtype=jnp.float32)
     weights = jnp.exp(-0.5 * (distance / sigma) ** 2)
     weights = weights / weights.sum()
     for axis in (0, 1):
-        padded = jnp.pad(image, [(BLUR * (a == axis),) * 2 for a in (0, 1)], mode="reflect")
+        padded = jnp.pad(image, [(reach * (a == axis),) * 2 for a in (0, 1)], mode="reflect")
         size = image.shape[axis]
         shifted = (
             weights[k] * jax.lax.slice_in_dim(padded, k, k + size, axis=axis)
-            for k in range(2 * BLUR + 1)
+            for k in range(2 * reach + 1)
         )
         image = sum(shifted, jnp.zeros_like(image))
     return image
@@ -387,9 +411,10 @@ def _at_speed(scene: Scene, speed, duration, height: int, width: int) -> Scene:
     """The scene, its paces scaled until the fastest point reaches this speed but never more.
 
     A faster pace sees more of the path, and so perhaps a faster part of it: hence the rounds.
-    The speed is measured at 128 times; 5 % cover what happens between them.
+    The speed is measured at 128 times, or at 1,024 of a camera that trembles; 5 % cover what
+    happens between them.
     """
-    times = duration * jnp.linspace(0.0, 1.0, 128)
+    times = duration * jnp.linspace(0.0, 1.0, 128 if scene.shake is None else 1024)
 
     def improve(round, carry):
         scene, _ = carry

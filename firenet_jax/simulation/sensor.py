@@ -40,6 +40,7 @@ from firenet_jax.simulation.scenes import Scene, flow, log_uniform, render, spee
 
 EPS = 0.001
 THRESHOLD, SPREAD, REFRACTORY = 0.18, 0.03, 1e-3  # defaults, as in the paper
+LEAST_THRESHOLD = 0.01  # as in ESIM
 NOISE_IN_LIGHT = 0.25  # times the noise in the dark
 TICKS = 1024  # per microsecond
 EVENTS_PER_PASS = 4  # of a pixel, in one pass over the picture: saves memory traffic
@@ -68,7 +69,8 @@ class SensorSettings:
     """
 
     threshold: float | None = None
-    """Mean of the contrast thresholds, in log intensity (default: 0.18)."""
+    """Mean of the contrast thresholds, in log intensity, at least 0.01 (default: 0.18). What is
+    drawn below 0.01 is 0.01."""
     threshold_spread: float | None = None
     """Standard deviation of the thresholds; ON and OFF are each drawn once per sequence (default:
     0.03)."""
@@ -85,8 +87,7 @@ class SensorSettings:
     """Standard deviation of the thresholds between pixels, in log intensity; about 0.03 in real
     sensors."""
     noise: tuple[float, float] | None = None
-    """Shot noise: events per second of a pixel in the dark. ON and OFF alternate. At most one per
-    pixel between two renderings."""
+    """Shot noise: events per second of a pixel in the dark. ON and OFF alternate."""
     noise_in_light: tuple[float, float] | None = None
     """Shot noise in full light, relative to that in the dark; between them it falls exponentially
     (default: linearly, to a quarter)."""
@@ -103,8 +104,8 @@ class SensorSettings:
     """Sinusoidal flicker of a lamp or screen at 60 to 240 Hz: its amplitude relative to the mean
     intensity, greatest at a random point of the image. Not set by --faults."""
     clean: float = 0.0
-    """Share of the sequences with the paper's thresholds and none of these faults (but after a stop
-    for good, --halt, half of them have noise, too)."""
+    """Share of the sequences with the paper's thresholds and none of these faults (but in firenet
+    train half of them have noise after a stop for good, --halt)."""
     mid_recording: bool = False
     """Start in the middle of a recording: each pixel's reference is anywhere within a threshold of
     the first rendering, instead of equal to it."""
@@ -123,6 +124,12 @@ class SensorSettings:
         if _on(self.hot) and self.hot[1] > 1:
             raise SettingsError(f"hot is {self.hot}, but is a part of the pixels: at most 1")
         check_sizes(self, "threshold")
+        lowest = min(x for x in (self.threshold, *(self.threshold_range or ()), 1) if x is not None)
+        if lowest < LEAST_THRESHOLD:
+            raise SettingsError(
+                f"a threshold of {lowest:g}, but at least {LEAST_THRESHOLD} in log intensity: with "
+                "less a pixel fires without end"
+            )
         others = "threshold_spread", "asymmetry", "refractory", "mismatch", "cutoff_dark"
         check_sizes(self, *others, zero=True)
         longest = max(self.refractory or 0, *(self.refractory_range or (0, 0)))
@@ -245,7 +252,7 @@ def random_sensor(
     if _on(settings.mismatch):
         own = settings.mismatch * jax.random.normal(mismatch_key, (2, *shape))
         on, off = on + own[0], off + own[1]
-    on, off = (jnp.maximum(threshold, 0.01) for threshold in (on, off))  # as in ESIM
+    on, off = (jnp.maximum(threshold, LEAST_THRESHOLD) for threshold in (on, off))
 
     drift = phase = None
     if _on(settings.leak) or _on(settings.hot) or _on(settings.noise):
@@ -447,6 +454,11 @@ def _shot_noise(bits: jax.Array, expected: jax.Array, polarity: jax.Array, ticks
     return Run(first, jnp.zeros_like(first), fires.astype(jnp.int32), polarity)
 
 
+def _most_noise(noise: jax.Array, slope: jax.Array | None) -> jax.Array:
+    """Events per second where there are most, in the dark or in full light."""
+    return noise[0] if slope is None else noise[0] * jnp.exp(jnp.maximum(slope, 0.0))
+
+
 def _stamps(first, spacing, number):
     """Microseconds after the interval's start of a run's number-th event; numpy or JAX, int32."""
     return (first + number * spacing + TICKS // 2) // TICKS
@@ -464,12 +476,12 @@ def _listed(sensor, state, image, duration):
 def event_list(sensor: Sensor, renderings: Iterable[tuple[int, ArrayLike]]) -> Iterator[Events]:
     """(microseconds, image (H, W)) in time order -> chunks of time-sorted events, one per interval.
 
-    The first rendering gives no events. `scenes.rendering_times` says how dense renderings must be.
+    The first rendering gives no events. `scenes.rendering_times` says how dense renderings must be;
+    for noise, of which there is at most one event between two, more are put between them.
     Raises SettingsError if time does not advance, or by more than two seconds.
     """
     state, previous = None, 0
-    for time, image in renderings:
-        time, image = int(time), jnp.asarray(image, jnp.float32)
+    for time, image in _dense(sensor, renderings):
         if state is None:
             state, previous = _first(sensor, image), time
             continue
@@ -483,6 +495,32 @@ def event_list(sensor: Sensor, renderings: Iterable[tuple[int, ArrayLike]]) -> I
         if int(fired):
             yield _events(jax.device_get(runs), previous)
         previous = time
+
+
+def _dense(
+    sensor: Sensor, renderings: Iterable[tuple[int, ArrayLike]]
+) -> Iterator[tuple[int, jax.Array]]:
+    """More renderings, so that two have at most half an event of a pixel's noise between them; log
+    intensity is linear from one of those that are given to the next."""
+    rate, last = 0.0, None
+    if sensor.noise is not None:
+        rate = 2e-6 * float(_most_noise(sensor.noise, sensor.noise_slope))  # per microsecond
+    for time, image in renderings:
+        time, image = int(time), jnp.asarray(image, jnp.float32)
+        if rate and last is not None:
+            before, seen = last
+            parts = min(math.ceil(rate * (time - before)), time - before)
+            for k in range(1, parts):
+                share = jnp.float32(k / parts)
+                yield before + (time - before) * k // parts, _between(seen, image, share)
+        last = time, image
+        yield last
+
+
+@jax.jit
+def _between(before: jax.Array, after: jax.Array, share: jax.Array) -> jax.Array:
+    low, high = log_intensity(before), log_intensity(after)
+    return jnp.exp(low + share * (high - low)) - EPS
 
 
 _first = jax.jit(first_state)
@@ -579,7 +617,7 @@ def renderings_needed(
     seen = speeds(scene, times.ravel(), height=height, width=width).reshape(times.shape)
     needed = duration * 1.1 * seen.max(-1) / 0.5  # 10 % for what is faster between these times
     if sensor.noise is not None:
-        needed = jnp.maximum(needed, 2 * duration * sensor.noise[0])
+        needed = jnp.maximum(needed, 2 * duration * _most_noise(sensor.noise, sensor.noise_slope))
     if sensor.lamp is not None:
         needed = jnp.where(sensor.lamp.swing.max() > 0, most, needed)
     return jnp.clip(jnp.ceil(needed), least, most).astype(jnp.int32)

@@ -102,7 +102,7 @@ def _cuttings(rng, paths: list[Path], count: int, size: int, source) -> list[np.
         for k in chosen:
             try:
                 cuttings.append(_cutting(rng, usable[k], size))
-            except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+            except Exception as error:  # Pillow raises every kind for damaged files
                 problem = f"{usable[k]}: {error}"
                 logger.warning("not used: %s", problem)
                 bad.add(k)

@@ -110,8 +110,10 @@ def _reason(error: OSError) -> str:
     return told[1] if told else " ".join(text.split())
 
 
-def lock(handle: int, path: Path) -> None:
+def lock(handle: int, path: Path, shared: bool = False) -> None:
     """Locks an open file or folder until it is closed or its process ends, even by a kill.
+
+    shared: others may lock it so, too, but none for itself.
 
     Raises OutputError, which names `path`, where another run has locked it. Does nothing where
     there are no such locks.
@@ -121,7 +123,7 @@ def lock(handle: int, path: Path) -> None:
     except ImportError:  # Windows
         return
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         raise OutputError(
             f"{path}: another run is writing it: wait for that, or choose another output"
@@ -147,18 +149,31 @@ def open_alone(beside: Path, path: Path) -> io.FileIO:
     return opened
 
 
+def remove_left(beside: Path) -> None:
+    """Removes the file in the making that a killed run left, but not one that is being written."""
+    try:
+        opened = beside.open("r+b")
+    except FileNotFoundError:
+        return
+    with opened, contextlib.suppress(OutputError):
+        lock(opened.fileno(), beside)
+        if os.name == "nt":  # an open file cannot be removed there, and has no lock
+            opened.close()
+        beside.unlink(missing_ok=True)
+
+
 @contextlib.contextmanager
-def locked(folder: Path, name: Path | None = None):
+def locked(folder: Path, name: Path | None = None, shared: bool = False):
     """No other run can lock this folder meanwhile. Raises OutputError where one has.
 
-    name: what the error calls it."""
+    name: what the error calls it. shared: others that share it may."""
     try:
         handle = os.open(folder, os.O_RDONLY)
     except PermissionError:  # Windows opens no folders
         yield
         return
     try:
-        lock(handle, name or folder)
+        lock(handle, name or folder, shared)
         yield
     finally:
         os.close(handle)

@@ -97,3 +97,11 @@ def alone_in(folder: Path):
     make_folder(folder)
     with locked(folder):
         yield
+
+
+@contextlib.contextmanager
+def side_by_side_in(folder: Path):
+    """Likewise for each of several processes that share the work: no run that is `alone_in` it."""
+    make_folder(folder)
+    with locked(folder, shared=True):
+        yield
