@@ -77,6 +77,19 @@ def save_weights(path: str | Path, weights: Weights) -> None:
             part.unlink()  # exists only if writing failed
 
 
+def _of_a_run(folder: Path) -> Path:
+    """Its best weights, or, if it was interrupted before its first validation, the last ones."""
+    for name in ("weights.npz", "last.npz"):
+        if (folder / name).is_file():
+            return folder / name
+    if (folder / "settings.json").is_file():
+        raise CheckpointError(
+            f"{folder} has no weights yet: the run writes them at its first validation "
+            "(--validate-every) or when it is stopped by Ctrl-C; let it go on"
+        )
+    raise CheckpointError(f"{folder} is a folder, but not of a training run; {TRY}")
+
+
 def load_weights(path: str | Path | None = None) -> Weights:
     """Weights from a .npz, a PyTorch checkpoint or the folder of a training run.
 
@@ -89,7 +102,7 @@ def load_weights(path: str | Path | None = None) -> Weights:
             return _load_npz(built_in)
     path = Path(path)
     if path.is_dir():
-        path = path / "weights.npz"  # a training run keeps its best weights here
+        path = _of_a_run(path)
     if not path.is_file():
         raise CheckpointError(f"{path} does not exist or is not a file; {TRY}")
     check_readable(path, CheckpointError)

@@ -24,10 +24,14 @@ Item = TypeVar("Item")
 class Events:
     """N events in time order, one array per column."""
 
-    t: np.ndarray  # (N,) int64, microseconds
-    x: np.ndarray  # (N,) int16, column, 0 at the left
-    y: np.ndarray  # (N,) int16, row, 0 at the top
-    p: np.ndarray  # (N,) bool, True: brighter
+    t: np.ndarray
+    """(N,) int64, microseconds."""
+    x: np.ndarray
+    """(N,) int16, column, 0 at the left."""
+    y: np.ndarray
+    """(N,) int16, row, 0 at the top."""
+    p: np.ndarray
+    """(N,) bool, True: brighter."""
 
     def __len__(self) -> int:
         return self.t.shape[0]
@@ -98,23 +102,30 @@ def concatenate(chunks: Sequence[Events | Rows]) -> Events | Rows:
 class Frames(NamedTuple):
     """The pictures that some cameras record alongside the events."""
 
-    times: np.ndarray  # (F,) int64, microseconds, on the clock of the events
-    read: Callable[[int], np.ndarray]  # i -> (H, W) uint8
-    # i -> (2, H, W) optical flow up to this picture, x then y, pixels per second; None: no flow
+    times: np.ndarray
+    """(F,) int64, microseconds, on the clock of the events."""
+    read: Callable[[int], np.ndarray]
+    """Index, 0 to F - 1 -> the picture (H, W) uint8."""
     flow: Callable[[int], np.ndarray | None] | None = None
-    damage: Exception | None = None  # that hides those after these
+    """Index -> (2, H, W) optical flow up to this picture, x then y, pixels per second; None: no
+    flow."""
+    damage: Exception | None = None
+    """What hides those after these, if the file is damaged there."""
 
 
 class Triggers(NamedTuple):
     """Edges of the signals at a camera's trigger inputs, in time order."""
 
-    times: np.ndarray  # (N,) int64, microseconds, on the clock of the events
-    ids: np.ndarray  # (N,) int64, number of the input
-    polarity: np.ndarray  # (N,) bool, True: rising, or the file does not distinguish the edges
+    times: np.ndarray
+    """(N,) int64, microseconds, on the clock of the events."""
+    ids: np.ndarray
+    """(N,) int64, number of the input."""
+    polarity: np.ndarray
+    """(N,) bool, True: rising, or the file does not distinguish the edges."""
 
 
 def no_triggers() -> None:
-    """The triggers of a recording that has none."""
+    """None, as the triggers of a recording that has none."""
 
 
 @dataclass(frozen=True)
@@ -122,15 +133,24 @@ class Recording:
     """A file or folder of events, opened but not read: memory does not grow with its length."""
 
     path: Path
-    format: str  # for people: "ECD folder"
+    format: str
+    """In words: "text", "AEDAT4"."""
     height: int
+    """Of the sensor, pixels."""
     width: int
-    events: Callable[[], Iterator[Events]]  # every call starts from the first event
-    count: int | None = None  # number of events, if the file states it
+    """Of the sensor, pixels."""
+    events: Callable[[], Iterator[Events]]
+    """Called, it gives all events from the first one on, in chunks."""
+    count: int | None = None
+    """Number of events, if the file states it."""
     frames: Frames | None = None
-    inferred: bool = False  # whether the sensor size was inferred from the events
-    grey: bool = False  # whether the file states that the sensor is monochrome
-    triggers: Callable[[], Triggers | None] = no_triggers  # reads the file; None: it has none
+    """The pictures that the camera recorded beside the events; None: none."""
+    inferred: bool = False
+    """Whether the sensor size was inferred from the events."""
+    grey: bool = False
+    """Whether the file states that the sensor is monochrome."""
+    triggers: Callable[[], Triggers | None] = no_triggers
+    """Called, it reads the edges at the trigger inputs; None: the file has none."""
 
     @property
     def pixels(self) -> int:

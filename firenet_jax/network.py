@@ -26,8 +26,10 @@ CHANNELS = 16
 class Weights:
     """A trained network: its parameters, and whether it expects normalised tensors."""
 
-    params: Any  # nested dict of float32 arrays, kernels (3, 3, in, out)
-    normalise: bool  # FireNet True, FireNet+ False
+    params: Any
+    """Nested dict of float32 arrays, kernels (3, 3, in, out)."""
+    normalise: bool
+    """Whether event tensors are to be normalised: FireNet True, FireNet+ False."""
 
     def __repr__(self) -> str:
         count = sum(getattr(leaf, "size", 1) for leaf in jax.tree.leaves(self.params))
@@ -37,8 +39,10 @@ class Weights:
 class State(NamedTuple):
     """What the network remembers between windows: the hidden maps of its two ConvGRUs."""
 
-    g1: jax.Array  # (B, H, W, 16) float32
-    g2: jax.Array  # (B, H, W, 16) float32
+    g1: jax.Array
+    """(B, H, W, 16) float32, of the first."""
+    g2: jax.Array
+    """(B, H, W, 16) float32, of the second."""
 
 
 def initial_state(batch: int, height: int, width: int) -> State:

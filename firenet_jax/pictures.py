@@ -60,8 +60,10 @@ class Display:
 class DisplayState(NamedTuple):
     """The ranges of the last images, the newest at the end; nan before the first image."""
 
-    low: jax.Array  # (B, 11) float32
-    high: jax.Array  # (B, 11) float32
+    low: jax.Array
+    """(B, 11) float32, what is shown as black."""
+    high: jax.Array
+    """(B, 11) float32, what is shown as white."""
 
 
 def initial_display_state(batch: int) -> DisplayState:

@@ -26,6 +26,16 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     return int(height), int(width)
 
 
+def sides(size: tuple[int, int] | str | None) -> tuple[int, int] | None:
+    """(height, width), or "WIDTHxHEIGHT" -> (height, width). Raises SettingsError."""
+    if size is None or isinstance(size, str):
+        return parse_size(size)
+    whole = len(size) == 2 and all(side == int(side) and 0 < side <= LONGEST_SIDE for side in size)
+    if not whole:
+        raise SettingsError(f'sensor size {size}: expected (height, width), or "WIDTHxHEIGHT"')
+    return int(size[0]), int(size[1])
+
+
 def check_seed(seed: int) -> None:
     """Raises SettingsError unless jax, numpy and grain all accept this seed."""
     if not 0 <= seed < 2**32:

@@ -47,7 +47,7 @@ class Windows:
     the window, windows overlap."""
     longest: float | None = None
     """A window of events ends after this many milliseconds at the latest. If no kind of window is
-    chosen: 40, or a twentieth of a recording shorter than 0.8 s."""
+    chosen: 40, or a twentieth of a recording, or part of one, shorter than 0.8 s."""
 
     def __post_init__(self):
         ways = [self.events, self.events_per_pixel, self.duration, self.frame_to_frame or None]

@@ -23,7 +23,7 @@ import pytest
 from PIL import Image
 
 from firenet_jax import readers
-from firenet_jax.errors import RecordingError
+from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.events import Events, _out_of_order, checked, concatenate
 from firenet_jax.readers import (
     aedat4,
@@ -99,7 +99,8 @@ def test_what_is_no_recording(tmp_path):
     refused(tmp_path / "missing.txt", "no such file")
     refused(write(tmp_path / "empty.txt", ""), "is empty")
     refused(write(tmp_path / "film.mp4", b"x"), "not a recording of a known format")
-    refused(tmp_path, "not a recording of a known format")
+    refused(tmp_path, "a folder that holds recordings: name them, as", "/*")
+    refused(write(tmp_path / "films/film.mp4", b"x").parent, "not a recording of a known format")
     refused(Path("/dev/null"), "is a pipe or device")
 
 
@@ -110,6 +111,16 @@ def test_sensor_size_is_inferred_with_a_notice(tmp_path, caplog):
     assert "320x240 inferred" in caplog.text
     with pytest.raises(RecordingError, match="holds no events"):
         open_recording(write(tmp_path / "none.txt", "\n\n"))
+
+
+def test_a_sensor_size_is_height_and_width_or_text(tmp_path):
+    path = write(tmp_path / "events.txt", "\n".join(ROWS))
+    for size in ((260, 346), "346x260", np.array([260, 346])):
+        recording = open_recording(path, sensor_size=size)
+        assert (recording.height, recording.width) == (260, 346)
+    for size in ("346", (346,), (0, 5), (1.5, 3), (2**16, 2)):
+        with pytest.raises(SettingsError, match="expected|at most"):
+            open_recording(path, sensor_size=size)
 
 
 def test_numbers_that_events_cannot_hold():

@@ -42,7 +42,9 @@ class Export:
       firenet export --web page --sample recording.zip
     """
 
-    weights: tyro.conf.Positional[Path] = Path(BUILT_IN)
+    weights: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="[WEIGHTS]")] = Path(
+        BUILT_IN
+    )
     """A training run, .npz or published checkpoint; the built-in weights if not given."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """A name that ends in .onnx, .stablehlo, .pth or .safetensors."""

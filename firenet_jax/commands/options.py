@@ -75,6 +75,8 @@ def _plain(hint: Any, text: str, required: bool) -> Any:
     said: dict[str, Any] = {"help": text}
     if not required:  # tyro's place for the default: an empty one after a text can make a line
         said = {"help_behavior_hint": lambda default: text + _in_words(default)}
+    if not required and POSITIONAL in extras:  # without a text, tyro takes the name for one
+        said = {"help": text, "help_behavior_hint": ""}
     whole = kind
     if types.NoneType in typing.get_args(kind):
         kind = next(part for part in typing.get_args(kind) if part is not types.NoneType)

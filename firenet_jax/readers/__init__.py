@@ -35,7 +35,7 @@ from firenet_jax.events import (
     no_triggers,
     until_damage,
 )
-from firenet_jax.settings import LONGEST_SIDE
+from firenet_jax.settings import LONGEST_SIDE, sides
 from firenet_jax.storage.files import check_no_pipe, check_readable, forbidden
 
 # In the order in which they are asked.
@@ -63,21 +63,22 @@ class Source:
 
 def open_recording(
     path: str | Path,
-    sensor_size: tuple[int, int] | None = None,
+    sensor_size: tuple[int, int] | str | None = None,
     strict: bool = False,
     columns: str | None = None,
 ) -> Recording:
     """A recording of any known format -> Recording, opened but not read.
 
-    sensor_size: (height, width) in pixels. Without it the file's own is taken; where the file
-    names none it is inferred by reading the events once, and a notice says so.
+    sensor_size: (height, width) in pixels, or "WIDTHxHEIGHT". Without it the file's own is taken;
+    where the file names none it is inferred by reading the events once, and a notice says so.
     A file is read up to where it is damaged, and single rows that cannot be events are left out,
     at most one in a thousand; a notice says what. strict: both raise RecordingError instead.
     columns: their order in a text or array that does not name them, such as "x,y,p,t".
     Raises RecordingError for a file that is missing, empty, damaged, of an unknown format or not
-    permitted to the user, and, while the events are read, for more bad rows than that.
+    permitted to the user, and, while the events are read, for more bad rows than that;
+    SettingsError for another sensor_size.
     """
-    path = Path(path)
+    path, sensor_size = Path(path), sides(sensor_size)
     source = _source(path, sensor_size, columns)
     rows_reported = 0
 
@@ -133,6 +134,8 @@ def _source(path: Path, sensor_size: tuple[int, int] | None, columns: str | None
         if name == "aedat2" and sensor_size is not None:  # counts rows from the bottom
             options["size"] = sensor_size
         return module.read(path, **options)
+    if path.is_dir() and any(is_recording(inner) for inner in path.iterdir()):
+        raise RecordingError(f"{path}: a folder that holds recordings: name them, as {path}/*")
     raise RecordingError(
         f"{path}: not a recording of a known format: expected text (.txt, .csv) or zip, "
         "an ECD or EVREAL folder, HDF5, .npy, .npz, N-Caltech101 .bin, .dat, .raw, .aedat, "

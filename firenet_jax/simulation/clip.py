@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
+from typing import Any, cast
 
 import av
 import numpy as np
@@ -70,7 +71,7 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
 def _matrix(frame: av.VideoFrame) -> tuple[int, int, int, int]:
     """(a, b, c, d): a pixel is to be shown at (a x + c y, b x + d y), as of a telephone held
     upright, or its front camera."""
-    for data in frame.side_data:
+    for data in cast(Any, frame.side_data):
         if data.type.name == "DISPLAYMATRIX":
             a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
             return a, b, c, d

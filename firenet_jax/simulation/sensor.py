@@ -547,10 +547,14 @@ def _events(runs: tuple[Run, ...], start: int) -> Events:
 class Simulation(NamedTuple):
     """T windows of B sequences. Images and displacement belong to the windows' ends."""
 
-    tensors: jax.Array  # (T, B, H, W, 5) float32, not normalised, window bounds as t_min and t_max
-    images: jax.Array  # (T, B, H, W) float32 in [0, 1], the truth at the window's end
-    displacement: jax.Array  # (T, B, H, W, 2) float32 pixels, from the window's start to its end
-    visible: jax.Array  # (T, B, H, W) bool, where the displacement leads to a visible place
+    tensors: jax.Array
+    """(T, B, H, W, 5) float32, not normalised, window bounds as t_min and t_max."""
+    images: jax.Array
+    """(T, B, H, W) float32 in [0, 1], the truth at the window's end."""
+    displacement: jax.Array
+    """(T, B, H, W, 2) float32 pixels, from the window's start to its end."""
+    visible: jax.Array
+    """(T, B, H, W) bool, where the displacement leads to a visible place."""
 
 
 def _draw(scenes: Scene, seconds: jax.Array, *, height: int, width: int) -> jax.Array:

@@ -103,10 +103,10 @@ def run(
                     _check_finite(terms, state, folder)
                 if done % settings.validate_every == 0 or done == last:
                     best = _judge(done, state, validation, settings, log, best)
-                logged = done % settings.log_every == 0
-                if done == last or (logged and _due(last_save, settings)):
+                if done == last or (done % settings.log_every == 0 and _due(last_save, settings)):
                     saved.save(done, args=ocp.args.StandardSave(state))
                     last_save = time.monotonic()
+            log.keep("last.npz", _weights(state))
         if interrupted and saved.latest_step() != done:
             saved.save(done, args=ocp.args.StandardSave(state))
     if interrupted:
@@ -149,11 +149,15 @@ def _judge(
     means = jax.tree.map(lambda *scores: np.mean(scores), *(r[0] for r in results))
     means = log.write(done, "validation", means)
     log.show(done, results[0][1])
-    weights = Weights(jax.tree.map(np.asarray, jax.device_get(state.params)), True)
+    weights = _weights(state)
     if means["loss"] < best:
         log.keep("weights.npz", weights)
     log.keep("last.npz", weights)
     return min(best, means["loss"])
+
+
+def _weights(state: TrainState) -> Weights:
+    return Weights(jax.tree.map(np.asarray, jax.device_get(state.params)), normalise=True)
 
 
 @contextlib.contextmanager

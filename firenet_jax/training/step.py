@@ -343,7 +343,10 @@ def train_step(
     """(state, source) -> (state, losses): make data, scan, update.
 
     source: the run's key and textures (N, S, S), from which a step's sequences are simulated; or
-    data from files.
+    data of your own, a `Simulation` of settings.windows windows and settings.batch sequences.
+    state: its arrays are donated, which saves copying them, so it cannot be used again: to take
+    several steps from one state, pass `jax.tree.map(jnp.copy, state)`.
+    losses: scalars by name, means over the step.
     """
     if isinstance(source, Simulation):
         data, seen, warm = source, None, False
