@@ -106,7 +106,7 @@ def run(
                 if done == last or (done % settings.log_every == 0 and _due(last_save, settings)):
                     saved.save(done, args=ocp.args.StandardSave(state))
                     last_save = time.monotonic()
-            log.keep("last.npz", _weights(state))
+            log.keep("last.npz", _weights(state))  # after Ctrl-C, too
         if interrupted and saved.latest_step() != done:
             saved.save(done, args=ocp.args.StandardSave(state))
     if interrupted:
