@@ -12,10 +12,15 @@ trained, and each step also has
 
     loss = L + 20 HOLD (|I - I_0| + 3 |mean(I - I_0)|) for each of the two, 20 windows in a step
 
-I_0 is what the network itself made, then: it may become another, but is to stay that. Gradients
-reach back over the windows of a step, states go on. What is written is a moving average.
+I_0 is what the network itself made, then: it may become another, but is to stay that. For
+palindromes a stage may have, in place of that, which is smaller where there is less contrast,
+
+    20 alike (1 - correlation(I, I_0) + 3 |mean(I - I_0)|)
+
+Gradients reach back over the windows of a step, states go on. What is written is a moving average.
 """
 
+import contextlib
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -28,6 +33,7 @@ import optax
 from at_rest import balanced
 
 from firenet_jax.checkpoint import load_weights, save_weights
+from firenet_jax.evaluation import metrics
 from firenet_jax.network import State, initial_state
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage.progress import bar
@@ -44,10 +50,18 @@ from firenet_jax.training.step import (
 
 NOISES = np.array([0, 0.02, 0.35, 0.1], np.float32)  # events per pixel, of each place at rest
 LONGEST, SHORTER = 30, 0.5  # steps of a rest; the share of those that end earlier
-TURNING, TURNS = 2, (6, 40)  # places that go to and fro; so many times
 CUT = 64  # pixels on a side of both
 HOLD = 2.0
 RAMP, DECAY = 40, 0.995  # steps until the rate is reached; of the average
+
+
+class Holding(NamedTuple):
+    """How a stage holds."""
+
+    turning: int = 2  # places that go to and fro
+    turns: tuple[int, int] = (6, 40)  # so many times
+    alike: float = 0.0  # how much correlation weighs, in place of HOLD
+    faint: float = metrics.FAINT  # what is so much brighter is so for sure, in the equalised losses
 
 
 class Held(NamedTuple):
@@ -61,13 +75,13 @@ class Held(NamedTuple):
     passes: jax.Array  # (M,) int32, how often they have been passed
 
 
-def nothing_held(windows: int) -> Held:
+def nothing_held(windows: int, turning: int = Holding().turning) -> Held:
     size = CUT, CUT
-    moving = jnp.zeros((windows, TURNING, *size))
+    moving = jnp.zeros((windows, turning, *size))
     return Held(
         initial_state(len(NOISES), *size), jnp.zeros((len(NOISES), *size)),
-        initial_state(TURNING, *size), jnp.zeros((*moving.shape, 5)),
-        (moving, moving), jnp.zeros(TURNING, jnp.int32),
+        initial_state(turning, *size), jnp.zeros((*moving.shape, 5)),
+        (moving, moving), jnp.zeros(turning, jnp.int32),
     )  # fmt: skip
 
 
@@ -77,6 +91,33 @@ def moved(images: jax.Array, wanted: jax.Array, counts: jax.Array) -> jax.Array:
     return jnp.abs(away).mean() + 3 * jnp.abs(away.mean((-2, -1))).mean()
 
 
+def unlike(images: jax.Array, wanted: jax.Array, counts: jax.Array) -> jax.Array:
+    """As `moved`, but by correlation, which less contrast does not raise."""
+    a, b = (each - each.mean((-2, -1), keepdims=True) for each in (images, wanted))
+    alike = (a * b).mean((-2, -1))
+    alike /= jnp.sqrt((a * a).mean((-2, -1)) * (b * b).mean((-2, -1)) + 0.02**4)
+    shift = jnp.abs((images - wanted).mean((-2, -1)))
+    return ((1 - alike + 3 * shift) * counts[None]).mean()
+
+
+@contextlib.contextmanager
+def telling_apart(faint: float):
+    """The equalised losses of what is compiled meanwhile tell apart what differs by half of this:
+    the less, the more faint texture of flat areas counts."""
+
+    def tell(faint, tones):
+        metrics.FAINT, metrics.TONES = faint, tones
+        metrics.equalised_ssim.clear_cache()  # what was compiled has the former
+        metrics.equalised_mse.clear_cache()
+
+    before = metrics.FAINT, metrics.TONES
+    tell(faint, np.linspace(-0.1, 1.1, round(4.8 / faint) + 1, dtype=np.float32))
+    try:
+        yield
+    finally:
+        tell(*before)
+
+
 def next_pass(held: Held) -> tuple[jax.Array, jax.Array]:
     """Event tensors of the next pass, backward first, and the images that are wanted."""
     back = (held.passes % 2 == 0)[None, :, None, None]
@@ -84,10 +125,10 @@ def next_pass(held: Held) -> tuple[jax.Array, jax.Array]:
     return tensors, jnp.where(back, *held.first)
 
 
-@partial(jax.jit, static_argnames="settings", donate_argnames="state")
+@partial(jax.jit, static_argnames=("settings", "how"), donate_argnames="state")
 def hold_step(
     state: TrainState, held: Held, source: tuple[jax.Array, jax.Array],
-    ends: tuple[jax.Array, jax.Array], rate: jax.Array, settings: StepSettings,
+    ends: tuple[jax.Array, jax.Array], rate: jax.Array, settings: StepSettings, how: Holding,
 ) -> tuple[TrainState, Held, dict[str, jax.Array]]:  # fmt: skip
     """source: as of `train_step`; ends: (N,) and (M,) bool, what ends with this step; rate: by
     which the update is multiplied."""
@@ -102,9 +143,10 @@ def hold_step(
         rested, at_rest = images_of(params, noise, settings, held.resting)
         turned, passed = images_of(params, tensors, settings, held.turning)
         rest = moved(at_rest, held.before[None], (held.before.max((-2, -1)) > 0) * 1.0)
-        palindrome = moved(passed, first, (held.passes >= 4) * 1.0)
+        counts = (held.passes >= 4) * 1.0
+        palindrome = (unlike if how.alike else moved)(passed, first, counts)
         terms |= {"loss": value, "rest": rest, "palindrome": palindrome}
-        value += settings.windows * HOLD * (rest + palindrome)
+        value += settings.windows * (HOLD * rest + (how.alike or HOLD) * palindrome)
         return value, (terms, last, images, rested, turned, passed)
 
     gradient, (terms, last, images, rested, turned, passed) = jax.grad(loss, has_aux=True)(
@@ -146,7 +188,9 @@ def hold_step(
     return state, held, terms
 
 
-def train_and_hold(path: Path, settings: Train, made: Path, steps: int) -> Path:
+def train_and_hold(
+    path: Path, settings: Train, made: Path, steps: int, how: Holding = Holding()
+) -> Path:
     """Trains the weights at `path` with these settings; writes them to `made`."""
     weights, step_settings = load_weights(path), replace(settings, steps=10**7).step_settings
     textures = load_textures(
@@ -154,15 +198,16 @@ def train_and_hold(path: Path, settings: Train, made: Path, steps: int) -> Path:
     )
     source = jax.random.key(settings.seed + 1), jnp.asarray(textures)
     state = initial_train_state(jax.tree.map(jnp.array, weights.params), step_settings)
-    held, average = nothing_held(settings.windows), jax.tree.map(jnp.array, weights.params)
+    held = nothing_held(settings.windows, how.turning)
+    average = jax.tree.map(jnp.array, weights.params)
     rng = np.random.default_rng(settings.seed)
-    left = np.ones(len(NOISES), int), np.ones(TURNING, int)  # steps of each
-    with bar(steps, "step") as progress:
+    left = np.ones(len(NOISES), int), np.ones(how.turning, int)  # steps of each
+    with bar(steps, "step") as progress, telling_apart(how.faint):
         for k in range(steps):
             rate = min(1, (k + 1) / RAMP) * (0.02 + 0.49 * (1 + np.cos(np.pi * k / steps)))
             ends = tuple(jnp.asarray(each <= 1) for each in left)
             state, held, terms = hold_step(
-                state, held, source, ends, jnp.float32(rate), step_settings
+                state, held, source, ends, jnp.float32(rate), step_settings, how
             )
             for each in left:
                 each -= 1
@@ -170,7 +215,7 @@ def train_and_hold(path: Path, settings: Train, made: Path, steps: int) -> Path:
                 short = rng.random() < SHORTER
                 left[0][place] = LONGEST ** rng.random() + 1 if short else LONGEST
             for place in np.flatnonzero(left[1] == 0):
-                left[1][place] = rng.uniform(*TURNS)
+                left[1][place] = rng.uniform(*how.turns)
             share = 1 - min(DECAY, (k + 1) / (k + 20))
             average = jax.tree.map(lambda a, p: a + share * (p - a), average, state.params)  # noqa: B023
             progress.update()

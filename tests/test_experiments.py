@@ -16,6 +16,7 @@ from test_pipeline import write_recording
 from test_snippets import write_with_frames
 
 import firenet_jax as fj
+from firenet_jax.evaluation import metrics
 from firenet_jax.simulation.scenes import SceneSettings
 from firenet_jax.training.losses import Loss
 from firenet_jax.training.settings import Train
@@ -205,6 +206,36 @@ def test_what_goes_to_and_fro_is_held_to_its_first_round(monkeypatch):
     assert holding.moved(even, images, np.ones(2)) == pytest.approx(0.4)
     assert holding.moved(odd, images, np.ones(2)) == pytest.approx(0.1)
     assert holding.moved(even, images, np.array([1, 0])) == pytest.approx(0.2)
+
+
+def test_what_is_alike_is_so_at_any_contrast(monkeypatch):
+    monkeypatch.syspath_prepend(EXPERIMENTS)
+    holding = importlib.import_module("holding")
+    images = np.random.default_rng(0).random((3, 2, 8, 8)).astype(np.float32)
+    flat = 0.5 * images + 0.5 * images.mean((-2, -1), keepdims=True)
+    assert float(holding.unlike(flat, images, np.ones(2))) == pytest.approx(0, abs=1e-3)
+    assert float(holding.unlike(images + 0.1, images, np.ones(2))) == pytest.approx(0.3, abs=1e-3)
+    for k in range(2):
+        other = images[::-1]
+        pairs = [(a[k].ravel(), b[k].ravel()) for a, b in zip(other, images, strict=True)]
+        expected = [1 - np.corrcoef(*p)[0, 1] + 3 * abs(np.subtract(*p).mean()) for p in pairs]
+        found = float(holding.unlike(other, images, np.arange(2) == k))
+        assert found == pytest.approx(np.mean(expected) / 2, abs=1e-3)
+
+
+def test_equalised_losses_tell_apart_what_a_stage_wants(monkeypatch):
+    """A texture of 0.003: 0.12 of the one, and 0.3 of the other."""
+    monkeypatch.syspath_prepend(EXPERIMENTS)
+    holding = importlib.import_module("holding")
+    image = np.full((36, 36), 0.5, np.float32)
+    texture = image + 0.003 * (-1) ** np.add.outer(*[np.arange(36) // 3] * 2)
+    usual = float(metrics.equalised_mse(image, texture))
+    with holding.telling_apart(0.05):
+        assert float(metrics.equalised_mse(image, texture)) == pytest.approx(usual, rel=1e-5)
+    with holding.telling_apart(0.02):
+        finer = float(metrics.equalised_mse(image, texture))
+    assert finer == pytest.approx((0.3 / 0.12) ** 2 * usual, rel=0.02)
+    assert metrics.equalised_mse(image, texture) == usual
 
 
 @pytest.mark.slow
