@@ -30,10 +30,14 @@ def sides(size: tuple[int, int] | str | None) -> tuple[int, int] | None:
     """(height, width), or "WIDTHxHEIGHT" -> (height, width). Raises SettingsError."""
     if size is None or isinstance(size, str):
         return parse_size(size)
-    whole = len(size) == 2 and all(side == int(side) and 0 < side <= LONGEST_SIDE for side in size)
-    if not whole:
+    try:
+        height, width = map(int, size)
+        whole = (height, width) == tuple(size)
+    except (TypeError, ValueError, OverflowError):
+        height = width = whole = 0
+    if not (whole and 0 < min(height, width) and max(height, width) <= LONGEST_SIDE):
         raise SettingsError(f'sensor size {size}: expected (height, width), or "WIDTHxHEIGHT"')
-    return int(size[0]), int(size[1])
+    return height, width
 
 
 def check_seed(seed: int) -> None:

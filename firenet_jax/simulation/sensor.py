@@ -41,6 +41,7 @@ from firenet_jax.simulation.scenes import Scene, flow, log_uniform, render, spee
 EPS = 0.001
 THRESHOLD, SPREAD, REFRACTORY = 0.18, 0.03, 1e-3  # defaults, as in the paper
 LEAST_THRESHOLD = 0.01  # as in ESIM
+MOST_NOISE = 10_000  # events per second of a pixel: of more, each takes a rendering
 NOISE_IN_LIGHT = 0.25  # times the noise in the dark
 TICKS = 1024  # per microsecond
 EVENTS_PER_PASS = 4  # of a pixel, in one pass over the picture: saves memory traffic
@@ -118,6 +119,8 @@ class SensorSettings:
         for name in ("noise", "leak", "hot", "cutoff", "flicker"):
             if _on(getattr(self, name)):
                 check_range(name, getattr(self, name))
+        if _on(self.noise) and self.noise[1] * max((1, *(self.noise_in_light or ()))) > MOST_NOISE:
+            raise SettingsError(f"noise of more than {MOST_NOISE:,} events per second of a pixel")
         if _on(self.flicker) and self.flicker[1] > 1:
             raise SettingsError(f"flicker is {self.flicker}, but light is not negative: at most 1")
         check_share("clean", self.clean, "sequences")
@@ -510,7 +513,7 @@ def _dense(
         if rate and last is not None:
             before, seen = last
             parts = min(math.ceil(rate * (time - before)), time - before)
-            for k in range(1, parts):
+            for k in range(1, parts if time - before <= MAX_INTERVAL else 0):
                 share = jnp.float32(k / parts)
                 yield before + (time - before) * k // parts, _between(seen, image, share)
         last = time, image

@@ -152,7 +152,7 @@ def open_alone(beside: Path, path: Path) -> io.FileIO:
 def remove_left(beside: Path) -> None:
     """Removes the file in the making that a killed run left, but not one that is being written."""
     try:
-        opened = beside.open("r+b")
+        opened = beside.open("rb")
     except FileNotFoundError:
         return
     with opened, contextlib.suppress(OutputError):

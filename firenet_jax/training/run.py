@@ -9,7 +9,7 @@ equals an uninterrupted one. A run is a folder:
     pictures/         of each validation: events, image, truth
     checkpoints/      the whole state (orbax), the newest two
     weights.npz       the parameters with the least validation loss so far
-    last.npz          those of the last validation
+    last.npz          those of the last validation, or of where Ctrl-C stopped it
 """
 
 import contextlib
@@ -106,9 +106,9 @@ def run(
                 if done == last or (done % settings.log_every == 0 and _due(last_save, settings)):
                     saved.save(done, args=ocp.args.StandardSave(state))
                     last_save = time.monotonic()
+            if interrupted and saved.latest_step() != done:
+                saved.save(done, args=ocp.args.StandardSave(state))
             log.keep("last.npz", _weights(state))  # after Ctrl-C, too
-        if interrupted and saved.latest_step() != done:
-            saved.save(done, args=ocp.args.StandardSave(state))
     if interrupted:
         raise KeyboardInterrupt(f"step {done} is saved: the same command goes on from there")
     if is_first():
