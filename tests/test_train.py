@@ -362,11 +362,11 @@ def test_a_run_older_than_an_option_goes_on_if_that_stands_at_its_default(tmp_pa
     begun(tmp_path, tiny(tmp_path))
     path = tmp_path / "settings.json"
     older = json.loads(path.read_text())
-    del older["remat"], older["scene"]["plain"]
+    del older["remat"], older["scene"]["hdr"]
     path.write_text(json.dumps(older))
     other = tiny(tmp_path).scene
     with pytest.raises(ValueError, match="other settings"):
-        train._check_settings(tmp_path, tiny(tmp_path, scene=replace(other, plain=0.5)))
+        train._check_settings(tmp_path, tiny(tmp_path, scene=replace(other, hdr=0.5)))
     train._check_settings(tmp_path, tiny(tmp_path))
     path.write_text('{"steps": 1')
     with pytest.raises(ValueError, match="settings.json is damaged"):
