@@ -304,6 +304,20 @@ def test_export_writes_each_kind(here, capsys, kind):
         assert (here / f"model.{kind}").read_bytes() == written
 
 
+def test_what_a_link_points_to_is_replaced(here, capsys):
+    (here / "real.pth").write_text("former")
+    (here / "link.pth").symlink_to("real.pth")
+    assert firenet(capsys, "export weights.npz -o link.pth --overwrite")[0] == 0
+    assert (here / "link.pth").is_symlink() and (here / "real.pth").stat().st_size > 100_000
+
+
+def test_a_folder_is_not_replaced(here, capsys):
+    (here / "model.pth").mkdir()
+    code, _, error = firenet(capsys, "export weights.npz -o model.pth --overwrite")
+    assert code == 1 and "model.pth is a folder: choose another name" in error
+    assert {path.name for path in here.iterdir()} == {"weights.npz", "model.pth"}
+
+
 @pytest.mark.parametrize(
     "line, said",
     [
@@ -314,6 +328,7 @@ def test_export_writes_each_kind(here, capsys, kind):
         ("export -o model.safetensors --no-normalise", "weights alone"),
         ("export missing.npz -o model.onnx", "missing.npz"),
         ("export -o nowhere/model.onnx", "cannot write"),
+        ("export -o model.partial.onnx", ".partial names what is not finished"),
     ],
 )
 def test_what_cannot_be_is_one_sentence(here, capsys, line, said):

@@ -11,6 +11,7 @@ from firenet_jax.storage.files import (
     OutputError,
     files_in,
     identity,
+    partial_name,
     read_arrays,
     write_arrays,
     write_text,
@@ -28,17 +29,25 @@ def test_what_was_written_is_read(tmp_path):
 
 
 def test_killed_while_writing_the_old_text_stays(tmp_path, monkeypatch):
-    path, write = tmp_path / "a.txt", Path.write_text
+    path, write = tmp_path / "a.txt", Path.write_bytes
     write_text(path, "old")
 
-    def killed(path, text, **how):
-        write(path, text[:1], **how)
+    def killed(path, content):
+        write(path, content[:1])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Path, "write_text", killed)
+    monkeypatch.setattr(Path, "write_bytes", killed)
     with pytest.raises(KeyboardInterrupt):
         write_text(path, "new")
-    assert path.read_text() == "old"
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]  # nor a part of it
+
+
+@pytest.mark.parametrize("name", ["a.partial.txt", "a.partial", "a.b.partial.txt"])
+def test_no_output_has_the_name_of_one_in_the_making(tmp_path, name):
+    """`a.txt` would be made in its place."""
+    with pytest.raises(OutputError, match=f"{name}: .partial names what is not finished"):
+        write_text(tmp_path / name, "all")
+    assert partial_name(tmp_path / "partial.txt").name == "partial.partial.txt"
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path):

@@ -21,6 +21,7 @@ from firenet_jax.events import Events, concatenate
 from firenet_jax.export.web_page import FILES
 from firenet_jax.readers import open_recording
 from firenet_jax.storage.sequence_file import Picture, write_sequence
+from firenet_jax.windows import Windows
 
 # Reconstructs each recording, sends its pictures here; then what the page itself says.
 TEST_PAGE = """<!doctype html><iframe id="page" src="index.html"></iframe><script type="module">
@@ -135,12 +136,17 @@ console.log(JSON.stringify(found));
 """
 
 
-def read_by_the_page(*names: str) -> dict:
+def by_the_page(script: str, *arguments: str):
+    """What a script prints, in whose text PAGE stands for events.js."""
     node = shutil.which("node") or node_of_pyright()
     page = Path(__file__).parents[1] / "firenet_jax" / "export" / "page" / "events.js"
-    module = READ.replace("PAGE", json.dumps(page.as_uri()))
-    command = [node, "--input-type=module", "-e", module, "--", *names]
+    module = script.replace("PAGE", json.dumps(page.as_uri()))
+    command = [node, "--input-type=module", "-e", module, "--", *arguments]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+def read_by_the_page(*names: str) -> dict:
+    return by_the_page(READ, *names)
 
 
 def read_alike(*names: str) -> dict:
@@ -227,6 +233,87 @@ def test_arrays_are_read_by_the_page_as_by_the_package(tmp_path, monkeypatch):
         assert read_by_the_page(name)[name] == f"{name}: is cut short"
 
 
+def test_fields_that_the_page_does_not_read_are_said(tmp_path, monkeypatch):
+    """The package reads them; skipped without their bytes, they would displace the others."""
+    monkeypatch.chdir(tmp_path)
+    kinds = {"text": "S2", "swapped": ">i4", "pair": ("<i4", (2,)), "date": "M8[us]"}
+    for name, kind in kinds.items():
+        made = [("t", "<i8"), ("more", *(kind if isinstance(kind, tuple) else (kind,)))]
+        rows = np.zeros(2, [*made, ("x", "<u2"), ("y", "<u2"), ("p", "?")])
+        rows["t"] = 1000, 2500
+        np.save(f"{name}.npy", rows)
+        assert len(concatenate([*open_recording(Path(f"{name}.npy")).events()]).t) == 2
+        said = read_by_the_page(f"{name}.npy")[f"{name}.npy"]
+        assert said == f"{name}.npy: has a field that this page does not read, the package does"
+
+
+def test_damaged_files_are_named_by_the_page(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with zipfile.ZipFile("a.zip", "w") as archive:
+        archive.writestr("events.txt", "40 30\n0.1 1 2 1\n0.2 3 4 0\n")
+    whole = Path("a.zip").read_bytes()
+    at = whole.rindex(b"PK\x05\x06")
+    Path("far.zip").write_bytes(whole[: at + 16] + b"\xff\xff\xff\x7f" + whole[at + 20 :])
+    Path("short.npy").write_bytes(b"\x93NUMPY")
+    found = read_by_the_page("far.zip", "short.npy")
+    for name, said in found.items():
+        assert said == f"{name}: is damaged, cut short or too large"
+    Path("ahead.zip").write_bytes(b"#!/bin/unpack\n" + whole)  # as the package reads it
+    read_alike("ahead.zip")
+
+
+HALVES = """
+import { windowsOf } from PAGE;
+const t = Float64Array.from({ length: 900 }, (_, n) => n);
+const sizes = JSON.parse(process.argv[1]);
+console.log(JSON.stringify(sizes.map(([width, height]) =>
+  windowsOf({ t, width, height }, undefined, 1e6)[0][1])));
+"""
+
+
+def test_windows_of_the_page_are_as_long_as_those_of_the_package():
+    """Also where .35 of the pixels is a half too many: 262.5 events."""
+    sizes = [(30, 25), (10, 1), (30, 1), (50, 1), (40, 30), (26, 40)]
+    found = by_the_page(HALVES, json.dumps(sizes))
+    assert found == [Windows(longest=1000).count(width * height) for width, height in sizes]
+
+
+TWO_AT_ONCE = """
+import { load, reconstruct } from "./network.js";
+const { run } = await load(false);
+const order = [];
+const one = (n) => run({ n }).then((found) => order.push(found), () => order.push("none"));
+await Promise.all([1, 2, 0, 3].map(one));
+console.log(JSON.stringify(order));
+"""
+RUNTIME_ALONE = """
+let running = 0;
+export const env = { wasm: {} };
+export class Tensor {}
+export const InferenceSession = { create: async () => ({ run: async ({ n }) => {
+  if (running++) throw new Error("two at once");
+  await new Promise((go) => setTimeout(go, 20));
+  running--;
+  if (n === 0) throw new Error("fails");
+  return n;
+} }) };
+"""
+
+
+def test_the_page_computes_one_window_at_a_time(tmp_path):
+    """The runtime cannot be entered twice: a recording may be dropped while another one plays."""
+    page = Path(__file__).parents[1] / "firenet_jax" / "export" / "page"
+    for name in ("network.js", "events.js"):
+        shutil.copy(page / name, tmp_path)
+    (tmp_path / "package.json").write_text('{"type": "module"}')
+    (tmp_path / "ort").mkdir()
+    (tmp_path / "ort" / "ort.wasm.min.mjs").write_text(RUNTIME_ALONE)
+    (tmp_path / "test.mjs").write_text(TWO_AT_ONCE)
+    node = shutil.which("node") or node_of_pyright()
+    said = subprocess.run([node, tmp_path / "test.mjs"], capture_output=True, text=True)
+    assert said.stdout and json.loads(said.stdout) == [1, 2, "none", 3], said.stderr
+
+
 def test_archives_that_are_of_no_use_are_named_by_the_page(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, method in {"two.zip": zipfile.ZIP_STORED, "bz.zip": zipfile.ZIP_BZIP2}.items():
@@ -258,6 +345,9 @@ def test_a_page_without_its_runtime_says_what_to_install(tmp_path, capsys, monke
     (runtime / "package.json").write_text('{"version": "1.2.3"}')
     code, _, error = firenet(capsys, "export --web page")
     assert code == 1 and f"1.2.3, which lacks {FILES[0]}" in error
+    (runtime / "package.json").write_text("[]")
+    code, _, error = firenet(capsys, "export --web page")
+    assert code == 1 and "does not hold onnxruntime-web" in error
 
 
 @pytest.fixture

@@ -21,7 +21,8 @@ from firenet_jax.readers import open_recording
 from firenet_jax.settings import check_none_idle, parse_size
 from firenet_jax.simulation.scenes import rendering_times, video
 from firenet_jax.simulation.sensor import event_list
-from firenet_jax.storage.files import OutputError, partial_name, writing
+from firenet_jax.storage.files import OutputError, partial_name, write_bytes
+from firenet_jax.storage.video import followed
 
 SIMULATED = 120, 160  # height, width
 KINDS = ".onnx", ".stablehlo", ".pth", ".safetensors"
@@ -137,8 +138,11 @@ def check_file(path: Path, settings: Export) -> None:
         raise OutputError(
             f"{path} holds weights alone: --picture and --no-normalise are for .onnx and .stablehlo"
         )
+    if path.is_dir():
+        raise OutputError(f"{path} is a folder: choose another name for the file")
     if path.exists() and not settings.overwrite:
         raise OutputError(f"{path} exists; choose another name or pass --overwrite")
+    partial_name(followed(path))  # refuses some names
 
 
 def runs_of(path: Path) -> bool:
@@ -155,10 +159,7 @@ def write_file(path: Path, settings: Export) -> None:
         ".pth": lambda: pth(weights),
         ".safetensors": lambda: safetensors(weights),
     }[path.suffix]()
-    beside = partial_name(path)
-    with writing(path):
-        beside.write_bytes(content)
-        beside.replace(path)
+    write_bytes(followed(path), content)
     normalised = weights.normalise and not (runs_of(path) and settings.normalise)
     tensors = "normalised" if normalised else "raw"
     print(f"{path}: {len(content) / 1000:.0f} kB, for {tensors} event tensors")

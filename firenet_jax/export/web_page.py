@@ -38,7 +38,7 @@ def runtime_version(runtime: Path) -> str:
     """What onnxruntime-web it is. Raises OutputError where the folder does not hold one of ours."""
     try:
         version = json.loads((runtime / "package.json").read_text())["version"]
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError):
         raise OutputError(
             f"{runtime} does not hold {RUNTIME}, which runs the network in browsers: get it with "
             f"npm install {RUNTIME}, and name its folder with --runtime"

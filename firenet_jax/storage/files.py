@@ -22,7 +22,15 @@ def named(path: Path) -> Path:
 
 
 def partial_name(path: Path) -> Path:
-    """Where an output is made: `video.mp4` -> `video.partial.mp4`, `out` -> `out.partial`."""
+    """Where an output is made: `video.mp4` -> `video.partial.mp4`, `out` -> `out.partial`.
+
+    Raises OutputError for a name of this kind: the output without `.partial` would replace it.
+    """
+    if path.suffix == ".partial" or path.stem.endswith(".partial"):
+        raise OutputError(
+            f"{path}: .partial names what is not finished: choose an output (of several "
+            "recordings: a recording) of another name"
+        )
     return path.with_name(f"{path.stem}.partial{path.suffix}")
 
 
@@ -183,19 +191,34 @@ def write_text(path: Path, text: str) -> None:
     """Writes UTF-8 atomically: a reader finds the old text or the new one, even after a kill.
 
     Raises OutputError where the file cannot be written."""
+    # names of files may hold bytes that are no text
+    write_bytes(path, text.encode("utf-8", errors="backslashreplace"))
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Writes a file, likewise, and leaves no part of one that cannot be written."""
     beside = partial_name(path)
-    with writing(path):
-        # names of files may hold bytes that are no text
-        beside.write_text(text, encoding="utf-8", errors="backslashreplace")
+    with writing(path), _removed_unless_written(beside):
+        beside.write_bytes(content)
         beside.replace(path)
 
 
 def write_arrays(path: Path, **arrays) -> None:
     """Writes an .npz, likewise."""
     beside = partial_name(path)
-    with writing(path):
+    with writing(path), _removed_unless_written(beside):
         np.savez_compressed(beside, **arrays)
         beside.replace(path)
+
+
+@contextlib.contextmanager
+def _removed_unless_written(beside: Path):
+    try:
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):  # that of what went wrong says more
+            beside.unlink(missing_ok=True)
+        raise
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:

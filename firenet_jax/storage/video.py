@@ -38,11 +38,14 @@ OTHER_FILES = (
 LIKE_A_FILE = re.compile(r"\.[A-Za-z][A-Za-z0-9]{2,4}")  # nor is any other such ending
 OURS = re.compile(r"timestamps\.txt|resume[.\w]*\.npz|(frame_\d{10,}|\d{19})\.png")  # in a folder
 RATES = 0.01, 10_000  # pictures per second
-GIF_RATE = 100  # pictures per second, the most that the format can express
+GIF_CLOCK = 100  # ticks per second
+GIF_RATE = 50  # pictures per second: browsers show one of a single tick for ten
 MP4_CLOCK = 90_000  # ticks per second, as is usual
 # Ticks between two pictures. An mp4 has 31 bits for the time between a picture and one that the
 # encoder puts four places before it.
 LONGEST_STEP = {".mp4": 2**28, ".gif": 2**16 - 1}
+# Of colours, as FFmpeg numbers them (ITU-T H.273): what its conversion from RGB makes, and sRGB.
+SD_MATRIX, LIMITED, REC_709, SRGB = 6, 1, 1, 13
 USUAL_RATE = 30  # pictures per second, the encoder's nominal rate without --fps
 PNG_LEVEL = 4  # on grey pictures 25 % faster than the default 6, files 2 % larger
 
@@ -253,7 +256,7 @@ class VideoWriter:
         self.tick, self.least = 1 / self.rate, 1  # seconds; ticks between two pictures
         if fps is None:
             gif = path.suffix == ".gif"
-            self.tick = Fraction(1, GIF_RATE if gif else MP4_CLOCK)
+            self.tick = Fraction(1, GIF_CLOCK if gif else MP4_CLOCK)
             self.least = 2 if gif else MP4_CLOCK // 1000
         self.speed, self.timed = speed, fps is None
         self.first = self.last = 0  # times of pictures, microseconds
@@ -277,6 +280,10 @@ class VideoWriter:
             self.stream.pix_fmt = "yuv420p"  # what every player can show
             # With its macroblock tree, x264 makes other bytes of the same pictures now and then.
             self.stream.options = {"crf": "18", "preset": "veryfast", "mbtree": "0"}
+            # Unless told, players take the matrix of SD for small pictures and of HD for large.
+            codec = self.stream.codec_context
+            codec.colorspace, codec.color_range = SD_MATRIX, LIMITED
+            codec.color_primaries, codec.color_trc = REC_709, SRGB
         self.stream.height, self.stream.width = height, width
         self.stream.codec_context.time_base = self.tick
         return self.stream

@@ -21,9 +21,18 @@ const column = (name) => keyOf(NAMES, name);
 
 /** Uint8Array and its file's name -> events. Throws an Error of one sentence. */
 export async function readRecording(bytes, name) {
+  try {
+    return await read(bytes, name);
+  } catch (error) {
+    if (error instanceof RangeError) throw new Error(`${name}: is damaged, cut short or too large`);
+    throw error;
+  }
+}
+
+async function read(bytes, name) {
   const lower = name.toLowerCase();
   if (lower.endsWith(".gz"))
-    return readRecording(await inflated(bytes, "gzip", name), name.slice(0, -3));
+    return read(await inflated(bytes, "gzip", name), name.slice(0, -3));
   if (lower.endsWith(".npz")) return npz(bytes, name);
   if (lower.endsWith(".npy")) return fromArray(npy(bytes, name), name);
   if (lower.endsWith(".zip")) {
@@ -57,10 +66,12 @@ function zipMembers(bytes, name) {
   while (end >= 0 && view.getUint32(end, true) !== 0x06054b50) end--;
   if (end < 0) throw new Error(`${name}: is damaged or cut short, its list of files is missing`);
   const members = [];
-  let at = view.getUint32(end + 16, true);
+  // What precedes the first file, as in archives that unpack themselves, is in none of the places.
+  const ahead = end - view.getUint32(end + 12, true) - view.getUint32(end + 16, true);
+  let at = ahead + view.getUint32(end + 16, true);
   for (let n = view.getUint16(end + 10, true); n > 0; n--) {
     const [named, extra, comment] = [28, 30, 32].map((k) => view.getUint16(at + k, true));
-    const local = view.getUint32(at + 42, true);
+    const local = ahead + view.getUint32(at + 42, true);
     members.push({
       name: new TextDecoder().decode(bytes.subarray(at + 46, at + 46 + named)),
       method: view.getUint16(at + 10, true),
@@ -106,6 +117,9 @@ function npy(bytes, name) {
   const head = new TextDecoder().decode(bytes.subarray(0, start));
   const type = /'descr': '[<|]([fiub][1248])'/.exec(head)?.[1];
   const fields = [...head.matchAll(/\('([^']*)', '[<|]([fiubV])(\d+)'\)/g)];
+  const strange = [...head.matchAll(/\('([^']*)', [^)]*/g)].length !== fields.length;
+  if (/'descr': \[/.test(head) && strange)
+    throw new Error(`${name}: has a field that this page does not read, the package does`);
   const shape = /'shape': \(([^)]*)\)/.exec(head)?.[1].split(",").filter((s) => s.trim()).map(Number);
   const row = fields.reduce((sum, [, , , size]) => sum + Number(size), 0) || Number(type?.[1]);
   if (shape && bytes.length < start + row * shape.reduce((a, b) => a * b, 1))
@@ -243,11 +257,17 @@ function checked({ t, x, y, p, width, height }, name) {
 
 // ---- windows
 
+/** As Python rounds. */
+function halfToEven(value) {
+  const near = Math.round(value);
+  return near - value === 0.5 && near % 2 ? near - 1 : near;
+}
+
 /** Events -> [start, stop) of each window: 0.35 events per pixel, at most 40 ms or, of a short
  * recording, a twentieth of it. `count` and `longest` (microseconds) set others. */
 export function windowsOf({ t, width, height }, count, longest) {
   const span = t[t.length - 1] - t[0];
-  count ??= Math.max(1, Math.round(0.35 * width * height));
+  count ??= Math.max(1, halfToEven(0.35 * width * height));
   longest ??= span >= 800_000 ? 40_000 : Math.max(Math.floor(span / 20), 1);
   const windows = [];
   for (let start = 0, stop = 0; start < t.length; start = stop) {

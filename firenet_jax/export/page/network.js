@@ -29,14 +29,18 @@ async function open(file, provider) {
   const zeros = (channels) => tensor(ort, new Float32Array(channels * 64), channels, 8, 8);
   // What a GPU cannot compute shows only when it runs.
   await session.run({ events: zeros(BINS), g1: zeros(CHANNELS), g2: zeros(CHANNELS) });
-  return { ort, session, provider };
+  // One after the other: the runtime cannot be entered while it waits for the GPU.
+  let last = Promise.resolve();
+  const run = (inputs, outputs) =>
+    (last = last.catch(() => {}).then(() => session.run(inputs, outputs)));
+  return { ort, run, provider };
 }
 
 const tensor = (ort, data, channels, height, width) =>
   new ort.Tensor("float32", data, [1, channels, height, width]);
 
 /** Events and windows -> {picture Uint8Array (height, width), tensor, time} one after the other. */
-export async function* reconstruct({ ort, session }, events, windows) {
+export async function* reconstruct({ ort, run }, events, windows) {
   const { width, height, t } = events;
   const zeros = () =>
     tensor(ort, new Float32Array(CHANNELS * height * width), CHANNELS, height, width);
@@ -44,7 +48,7 @@ export async function* reconstruct({ ort, session }, events, windows) {
   for (const window of windows) {
     const votes = voxels(events, window);
     const input = tensor(ort, votes, BINS, height, width);
-    const found = await session.run({ events: input, g1, g2 }, ["picture", "g1_next", "g2_next"]);
+    const found = await run({ events: input, g1, g2 }, ["picture", "g1_next", "g2_next"]);
     [g1, g2] = [found.g1_next, found.g2_next];
     yield { picture: found.picture.data, tensor: votes, time: t[window[1] - 1] };
   }
