@@ -275,6 +275,20 @@ def test_colours_are_those_that_an_mp4_says(tmp_path):
     assert np.abs(decoded(tmp_path / "a.mp4")[0] - color.astype(int)).max() <= 3
 
 
+@pytest.mark.parametrize("kind", ["mp4", "gif"])
+@pytest.mark.parametrize("step", [0.1, 2.5])
+def test_the_last_picture_stays_as_long_as_the_one_before(tmp_path, kind, step):
+    writer = VideoWriter(tmp_path / f"a.{kind}", None)
+    for number, picture in enumerate(ramp(7)):
+        writer.write(picture, round(1e6 * step * number))
+    writer.finish()
+    with av.open(str(tmp_path / f"a.{kind}")) as container:
+        frames = list(container.decode(video=0))
+        shown = [float(frame.duration * frame.time_base) for frame in frames]
+        assert container.duration == pytest.approx(7e6 * step, abs=1e3)
+    assert shown == pytest.approx([step] * 7)
+
+
 @pytest.mark.parametrize("name", ["a.partial.mp4", "a.partial"])
 def test_an_output_is_not_what_another_is_made_in(tmp_path, name):
     with pytest.raises(OutputError, match=f"{name}: .partial names what is not finished"):

@@ -246,7 +246,7 @@ class VideoWriter:
 
     With `fps` all are shown equally long; without, from their own time to that of the next, `speed`
     times as fast, but not closer to each other than the format can express, nor farther apart: of a
-    longer pause the rest is left out, and a warning says so.
+    longer pause the rest is left out, and a warning says so. The last stays as long as that before.
     Raises OutputError where the file cannot be written, or another run writes it.
     """
 
@@ -260,7 +260,7 @@ class VideoWriter:
             self.least = 2 if gif else MP4_CLOCK // 1000
         self.speed, self.timed = speed, fps is None
         self.first = self.last = 0  # times of pictures, microseconds
-        self.at = 0  # ticks, where the last picture is
+        self.at = self.step = 0  # ticks, where the last picture is, and since the one before
         self.left_out = 0  # ticks of pauses
         self.count = 0
         with writing(path):
@@ -268,6 +268,7 @@ class VideoWriter:
             # absolute, for FFmpeg takes what precedes a colon for a protocol
             self.container = av.open(str(self.partial.absolute()), "w")
         self.stream: Any = None
+        self.waiting: list = []  # packets, until one sees how long the last picture is shown
         self.filter: Graph | None = None
 
     def _start(self, height: int, width: int) -> Any:
@@ -305,14 +306,17 @@ class VideoWriter:
         layout = "gray" if picture.ndim == 2 else "rgb24"
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=layout)
         self.first, self.last = (self.first if self.count else time), time
-        self.at = self._next() if self.count else 0
+        if self.count:
+            at, self.at = self.at, self._next()
+            self.step = self.at - at
         frame.pts, frame.time_base = self.at, self.tick
         self.count += 1
         if self.filter:
             self.filter.vpush(frame)
             frame = self.filter.vpull()
         with self._encoding():
-            self.container.mux(stream.encode(frame))
+            self.container.mux(self.waiting)
+            self.waiting = stream.encode(frame)
 
     def _next(self) -> int:
         """Where the picture that follows is shown, in ticks."""
@@ -344,7 +348,12 @@ class VideoWriter:
     def finish(self) -> None:
         with self._encoding():
             if self.stream is not None:
-                self.container.mux(self.stream.encode(None))
+                self.waiting += self.stream.encode(None)
+            for packet in self.waiting:
+                # Nothing follows the last picture, nor the last packet, which may be another's.
+                if self.step and (packet.pts == self.at or packet is self.waiting[-1]):
+                    packet.duration = self.step
+                self.container.mux(packet)
             self.container.close()
             if os.name == "nt":  # an open file cannot be renamed there, and has no lock
                 self.held.close()
