@@ -310,6 +310,31 @@ def test_an_interrupted_evaluation_goes_on(folder, tmp_path, monkeypatch):
             assert again["means"][kind][name]["means"] == whole["means"][kind][name]["means"]
 
 
+def test_flow_of_frames_that_are_not_in_a_row_is_no_flow_that_is_missing(folder, tmp_path):
+    ours = settings(
+        folder, tmp_path / "out", data=(folder / "data" / "a.h5",), methods="hf", keep_ratio=0.4
+    )
+    (sequence,) = run(ours)["sequences"].values()
+    assert sequence["methods"]["hf"]["gaps"]["temporal_error"] == "no two frames in a row"
+
+
+def test_numbers_of_an_earlier_run_that_are_not_whole_are_named(folder, tmp_path):
+    ours = settings(folder, tmp_path / "out", data=(folder / "data" / "a.h5",), methods="hf")
+    run(ours)
+    path = tmp_path / "out" / "results" / "a" / "hf.json"
+    whole = path.read_text()
+    for part in ("values", "gaps"):
+        saved = json.loads(whole)
+        saved["result"] |= {"values": {}, "gaps": {}} if part == "gaps" else {part: None}
+        path.write_text(json.dumps(saved))
+        with pytest.raises(OutputError, match="hf.json is damaged .*: remove it"):
+            run(ours)
+    path.write_text(whole)
+    np.savez(path.with_suffix(".npz"), a=1)
+    with pytest.raises(OutputError, match="hf.npz is damaged .*: remove it"):
+        run(ours)
+
+
 def test_damaged_pictures_of_an_earlier_run_are_named(folder, tmp_path):
     ours = settings(folder, tmp_path / "out", data=(folder / "data" / "a.h5",), methods="hf")
     run(ours)
@@ -490,6 +515,17 @@ def test_a_prediction_counts_once_and_within_the_tolerance():
     moments = [0, 900, 1040, 1100, 1500, 2101, 2900, 3100]
     found = list(matched(((t, f"at {t}") for t in moments), times, 100))
     assert found == [(0, "at 0"), (1, "at 1040"), (3, "at 2900")]
+
+
+def test_a_window_up_to_a_frame_is_compared_with_none_before():
+    """Events that end right after a frame, as where a scene stops then, speak of the next one."""
+    times = np.array([0, 1000, 2000, 3000])
+    moments = [60, 950, 1060, 2000, 2950, 3000]  # 2000: a window without events, 3000: at it alone
+    found = list(matched(((t, f"at {t}") for t in moments), times, 100, True))
+    assert found == [(1, "at 950"), (2, "at 2000"), (3, "at 2950")]
+    moments = [60, 1060, 2060, 3060]
+    assert not list(matched(((t, "") for t in moments), times, 100, True))
+    assert len(list(matched(((t, "") for t in moments), times, 100))) == 4
 
 
 def test_intervals_of_the_event_camera_dataset(tmp_path):

@@ -6,6 +6,7 @@ import http.client
 import io
 import itertools
 import json
+import os
 import socket
 import struct
 import sys
@@ -158,6 +159,21 @@ def test_a_broken_line_of_text_is_left_out_and_said(caplog):
         list(sources.decoded([b"0.5 2 3 1\n1e10 2 3 1\n"], "text"))
 
 
+@pytest.mark.parametrize("first", [b"t x y p\n", b"0 3 1\n"])
+def test_a_stream_may_begin_with_a_broken_line_alone(first):
+    """Whether the events come with it or later is chance."""
+    for pieces in ([first + b"1 2 3 1\n"], [first, b"", b"1 2 3 1\n"]):
+        assert rows(concatenate([*sources.decoded(pieces, "text")])) == [(1, 2, 3, True)]
+    with pytest.raises(RecordingError, match="'a b c d' where lines of t x y p"):
+        list(sources.decoded(itertools.repeat(b"a b c d\n", 2), "text"))
+
+
+@pytest.mark.parametrize("row", ["10 5 3 nan", "10 5 3 7", "10 1.7 3 1", "10 1 -0.9 1", "1 1 0 5"])
+def test_other_columns_are_no_events(row, caplog):
+    found = [*sources.decoded([b"1 2 3 1\n" + row.encode() + b"\n11 2 3 -1\n"], "text")]
+    assert concatenate(found).t.tolist() == [1, 11] and f"holds '{row}'" in caplog.text
+
+
 @pytest.mark.parametrize("wire", list(sources.BINARY))
 def test_any_bytes_decode_to_something(wire):
     noise = np.random.default_rng(0).bytes(13 * 800)
@@ -276,6 +292,20 @@ def test_a_file_that_is_begun_anew_is_said(tmp_path):
     pieces = sources.growing(path)
     assert len(next(pieces)) == 1300 and next(pieces) == b""
     path.write_bytes(b"")
+    with pytest.raises(RecordingError, match=r"events\.bin: was begun anew by its writer"):
+        next(pieces)
+
+
+def test_a_file_that_is_replaced_is_said(tmp_path):
+    """Writers of new files rename them to their names, or remove the old one before."""
+    path, later = tmp_path / "events.bin", tmp_path / "later.bin"
+    path.write_bytes(b"a" * 26)
+    pieces = sources.growing(path)
+    assert len(next(pieces)) == 26 and next(pieces) == b""
+    path.rename(tmp_path / "old.bin")
+    assert next(pieces) == b""  # a new one may come
+    later.write_bytes(b"b" * 260)
+    later.rename(path)
     with pytest.raises(RecordingError, match=r"events\.bin: was begun anew by its writer"):
         next(pieces)
 
@@ -406,6 +436,25 @@ def test_a_sender_that_starts_again_is_seen_again(broken):
     assert np.diff(found.t[-200:]).tolist() == np.diff(after[-1].t).tolist()
 
 
+@pytest.mark.parametrize("piece", [100, 5000])
+def test_a_late_time_at_the_beginning_is_survived(piece):
+    events = some_events(20_000, last=10**6)
+    events.t[50] = 2**45
+    figures = Figures()
+    arrivals = [events.select(slice(k, k + piece)) for k in range(0, 20_000, piece)]
+    found = concatenate(list(sound(arrivals, HEIGHT, WIDTH, figures)))
+    assert len(found) == 20_000 - figures.bad >= 20_000 - 1000 - piece
+    assert (np.diff(found.t) >= 0).all() and figures.outside == 0
+
+
+def test_a_sender_that_starts_again_at_once_is_seen_again():
+    later = [some_events(500, seed=k, start=10**6 * k, last=10**6) for k in range(9)]
+    arrivals = [some_events(500, start=10**9), *later]
+    figures = Figures()
+    found = concatenate(list(sound(arrivals, HEIGHT, WIDTH, figures)))
+    assert len(found) >= 5000 - 1000 and (np.diff(found.t) >= 0).all()
+
+
 # ---- Threads
 
 
@@ -463,9 +512,10 @@ def page():
     server.server_close()
 
 
-def ask(port, path, host=None):
+def ask(port, path, host=None, **headers):
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    connection.request("GET", path, headers={} if host is None else {"Host": host})
+    headers |= {} if host is None else {"Host": host}
+    connection.request("GET", path, headers={k.replace("_", "-"): v for k, v in headers.items()})
     return connection, connection.getresponse()
 
 
@@ -489,6 +539,30 @@ def test_nobody_else_may_ask(page):
         connection, response = ask(port, path, host)
         assert response.status == status
         connection.close()
+
+
+@pytest.mark.parametrize("path", ["/video", "/figures"])
+def test_no_page_of_somebody_else_shows_it(page, path):
+    board, port = page
+    board.hang(np.zeros((16, 32, 3), np.uint8))
+    for site, status in {"cross-site": 403, "same-site": 403, "same-origin": 200}.items():
+        connection, response = ask(port, path, Sec_Fetch_Site=site)
+        assert response.status == status
+        connection.close()
+
+
+def test_who_has_left_the_video_is_noticed_without_new_pictures(page, monkeypatch):
+    monkeypatch.setattr("firenet_jax.live.page.AGAIN", 0.02)
+    before = threading.active_count()
+    for connection, response in [ask(page[1], "/video") for _ in range(3)]:
+        assert response.readline() == b"--picture\r\n"
+        response.close()
+        connection.close()
+    for _ in range(100):
+        if threading.active_count() <= before:
+            return
+        time.sleep(0.05)
+    raise AssertionError(f"{threading.active_count() - before} threads are left")
 
 
 def test_a_browser_that_goes_away_leaves_no_traceback(page, capfd):
@@ -532,11 +606,32 @@ def test_a_recording_played(tmp_path, monkeypatch, capsys):
     assert "of 6,000 events" in said and "http://127.0.0.1:" in said
 
 
+def test_a_name_that_is_no_text(tmp_path, monkeypatch):
+    board, name = Board(), os.fsdecode(b"bad\xff.aedat4")
+    server = serve(board, dict, name, 0)
+    connection, response = ask(server.server_address[1], "/")
+    assert "bad\\udcff.aedat4" in response.read().decode()
+    connection.close()
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+def test_a_named_pipe_is_read_by_standard_input(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(RecordingError, match="is a pipe: read it by firenet live - <"):
+        live.source_of(live.Live(str(tmp_path / "pipe"), sensor_size="20x12"))
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
         ("udp://127.0.0.1:3333", "pass --sensor-size"),
         ("udp://nowhere --sensor-size 20x12", "expected udp://HOST:PORT"),
+        ("udp://[::1:3333 --sensor-size 20x12", "expected udp://HOST:PORT"),
+        ("udp://[zz]:33 --sensor-size 20x12", "expected udp://HOST:PORT"),
+        ("tcp://a..b:3333 --sensor-size 20x12 --port 0", "tcp://a..b:3333: "),
+        ("udp://a..b:3333 --sensor-size 20x12 --port 0", "udp://a..b:3333: "),
         ("missing.bin --sensor-size 20x12", "no such file, and no source"),
         ("a.txt --replay --speed 0", "speed is 0.0"),
         ("a.txt --replay --speed inf", "speed is inf"),

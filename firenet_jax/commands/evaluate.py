@@ -333,7 +333,8 @@ def open_folder(
             continue
         try:
             was, result = {**saved["record"]}, Measured(**saved["result"])
-        except (KeyError, TypeError) as error:
+            summary(result)
+        except (KeyError, TypeError, ValueError, AttributeError, ZeroDivisionError) as error:
             raise OutputError(f"{path} is damaged ({error}): remove it") from error
         if not settings.overwrite:
             check_same(
@@ -407,12 +408,14 @@ def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
 
     Only of what is done: what became a gap may have pictures of other settings on disk.
     """
-    kept = {
-        method: read_arrays(result_file(settings, name, method).with_suffix(".npz"))
-        for name, method in done
-        if name == plan.name
-    }
     names = [f"{kind}_frames" for kind in ("stills", "clip")]
+    kept = {}
+    for name, method in done:
+        if name == plan.name:
+            path = result_file(settings, name, method).with_suffix(".npz")
+            kept[method] = read_arrays(path)
+            if not {"stills", "clip", *names} <= kept[method].keys():
+                raise OutputError(f"{path} is damaged (no pictures): remove it and run again")
     events = events_before(
         plan, settings, {number for f in kept.values() for n in names for number in f[n].tolist()}
     )
@@ -460,7 +463,8 @@ def events_before(plan: Plan, settings: Evaluate, numbers: set[int]) -> dict[int
         return found
     latest = int(plan.times[plan.last - 1]) + settings.protocol.tolerated
     windows = ((e.time, e.events) for e in until(latest, steps_of(plan)) if e.time is not None)
-    for place, events in matched(windows, plan.times, settings.protocol.tolerated):
+    tolerated = settings.protocol.tolerated
+    for place, events in matched(windows, plan.times, tolerated, plan.up_to_frames):
         if not left:
             break
         if (number := int(plan.numbers[place])) in left:

@@ -108,16 +108,19 @@ def source_of(settings: Live) -> sources.Source:
 def _pieces(source: str):
     if source == "-":
         return sources.standard_input(), False
-    address = urlsplit(source)
-    if address.scheme in ("udp", "tcp"):
+    scheme = source.partition("://")[0]
+    if scheme in ("udp", "tcp"):
         try:
+            address = urlsplit(source)
             host, port = address.hostname, address.port
         except ValueError:
-            port = None
+            host = port = None
         if not host or not port:
-            raise SettingsError(f"{source}: expected {address.scheme}://HOST:PORT")
-        reach = sources.udp if address.scheme == "udp" else sources.tcp
-        return reach(host, port), address.scheme == "udp"
+            raise SettingsError(f"{source}: expected {scheme}://HOST:PORT")
+        reach = sources.udp if scheme == "udp" else sources.tcp
+        return reach(host, port), scheme == "udp"
+    if Path(source).is_fifo():
+        raise RecordingError(f"{source}: is a pipe: read it by firenet live - < {source}")
     if not Path(source).is_file():
         raise RecordingError(
             f"{source}: no such file, and no source: camera, udp://HOST:PORT, tcp://HOST:PORT, - "

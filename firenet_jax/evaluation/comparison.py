@@ -44,6 +44,11 @@ class Plan(NamedTuple):
     wanted: np.ndarray | Grid | None = None  # times of images; None: one per window
 
     @property
+    def up_to_frames(self) -> bool:
+        """Whether an image is of the events up to a frame."""
+        return self.windows.frame_to_frame and self.wanted is None
+
+    @property
     def frames(self) -> Frames:
         """The recording's frames; without any there is no plan."""
         return cast(Frames, self.recording.frames)
@@ -62,14 +67,24 @@ Prediction = TypeVar("Prediction")
 
 
 def matched(
-    predictions: Iterator[tuple[int, Prediction]], times: np.ndarray, tolerance: int
+    predictions: Iterator[tuple[int, Prediction]],
+    times: np.ndarray,
+    tolerance: int,
+    up_to_frames: bool = False,
 ) -> Iterator[tuple[int, Prediction]]:
     """(time, image or other prediction) in time order -> (index of a frame, prediction): for each
-    frame the closest one, if it is at most `tolerance` microseconds away."""
+    frame the closest one, if it is at most `tolerance` microseconds away.
+
+    up_to_frames: predictions are of windows that last until a frame; it is the only one that each
+    may have, even where the last event is closer to the frame at the window's beginning.
+    """
     best: tuple[int, int, Prediction] | None = None
     for moment, image in predictions:
         after = int(np.searchsorted(times, moment))
-        near = [place for place in (after - 1, after) if 0 <= place < len(times)]
+        around = (after,) if up_to_frames else (after - 1, after)
+        near = [place for place in around if 0 <= place < len(times)]
+        if not near:
+            continue
         place = min(near, key=lambda place: abs(int(times[place]) - moment))
         distance = abs(int(times[place]) - moment)
         if distance > tolerance:
@@ -77,7 +92,8 @@ def matched(
         if best is not None and best[0] != place:
             yield best[0], best[2]
             best = None
-        if best is None or distance < best[1]:
+        # Of windows up to a frame, a second one is of events at its very time, and begins there.
+        if best is None or distance < best[1] and not up_to_frames:
             best = place, distance, image
     if best is not None:
         yield best[0], best[2]
@@ -94,6 +110,7 @@ class Measurements:
         self.no_lpips = "no weights" if learned is None else "pictures too small"
         self.places: list[int] = []
         self.values = {name: [] for name in METRICS if name != "lpips" or self.learned}
+        self.flow = False  # whether any frame had it
         self.last: tuple[int, np.ndarray, np.ndarray] | None = None  # place, image, truth
 
     def add(self, batch: list[Comparison]) -> tuple[np.ndarray, np.ndarray]:
@@ -112,6 +129,7 @@ class Measurements:
         if self.learned:
             distances = lpips.lpips(self.learned, *map(_whole, compared))
             self.values["lpips"] += distances[:count].tolist()
+        self.flow |= any(entry.flow is not None for entry in batch)
         self.values["temporal_error"] += self._temporal(batch, images, truths)
         self.places += places
         return compared
@@ -147,7 +165,7 @@ class Measurements:
                 place = self.places[good.index(False)]
                 gaps[name] = f"infinite at frame {self.plan.numbers[place] + 1}"
             elif all(value is None for value in series):
-                gaps[name] = "no flow"
+                gaps[name] = "no two frames in a row" if self.flow else "no flow"
             values[name] = [v if ok else None for v, ok in zip(series, good, strict=True)]
         if not self.learned:
             gaps["lpips"] = self.no_lpips

@@ -2,10 +2,10 @@
 
 The protocol is EVREAL's for the paper's data. Window i holds the events between frames i-1 and i.
 Reconstruction begins 10 s before the part that counts. A prediction has the time of its window's
-last event (of its end, if the window is empty) and counts if that is within 1 ms of a frame. Images
-at given times are steps whose new state is discarded; the state advances by windows of fixed size
-(instants.py). Frames and predictions are compared as (H, W) float32, clipped to 0 to 1, optionally
-after histogram equalisation. `Protocol` changes each of these.
+last event (of its end, if the window is empty) and counts if that is within 1 ms of the frame.
+Images at given times are steps whose new state is discarded; the state advances by windows of fixed
+size (instants.py). Frames and predictions are compared as (H, W) float32, clipped to 0 to 1,
+optionally after histogram equalisation. `Protocol` changes each of these.
 """
 
 import copy
@@ -278,7 +278,7 @@ def evaluate(
     found, pictures = Measurements(plan, protocol.equalise, learned), Pictures(plan)
     waiting: list[Comparison] = []
     try:
-        for place, image in matched(predictions(), plan.times, tolerance):
+        for place, image in matched(predictions(), plan.times, tolerance, plan.up_to_frames):
             if plan.first <= place < plan.last:
                 truth = plan.frames.read(int(plan.numbers[place]))
                 if truth.shape != image.shape:

@@ -52,6 +52,7 @@ class Figures:
 
     events: int = 0
     bad: int = 0  # outside the sensor or back in time: left out
+    outside: int = 0  # of those, outside
     shown: int = 0  # windows that became pictures
     dropped: int = 0  # windows that did not
     latencies: deque = field(default_factory=lambda: deque(maxlen=LATENCIES_KEPT))  # seconds
@@ -75,7 +76,9 @@ def sound(
 ) -> Iterator[Events]:
     """Passes on what can be events of this sensor, in order of time; counts the rest.
 
-    Raises RecordingError where most of the first thousand are none.
+    After an event of a wrong, late time those that follow count as back in time, until there are
+    so many that the sender's clock must have been set. Raises RecordingError where most of the
+    first thousand are outside the sensor.
     """
     last, shift, behind = None, 0, 0
     for events in arrivals:
@@ -91,11 +94,11 @@ def sound(
             figures.events += len(events)
             if not good.all():
                 figures.bad += int(len(good) - good.sum())
-                if figures.events >= BAD_AFTER and 2 * figures.bad > figures.events:
+                figures.outside += int(len(inside) - inside.sum())
+                if figures.events >= BAD_AFTER and 2 * figures.outside > figures.events:
                     raise RecordingError(
-                        f"{figures.bad:,} of {figures.events:,} events lie outside a sensor of "
-                        f"{width}x{height} pixels or go back in time: are --sensor-size and --wire "
-                        "right?"
+                        f"{figures.outside:,} of {figures.events:,} events lie outside a sensor of "
+                        f"{width}x{height} pixels: are --sensor-size and --wire right?"
                     )
                 events = events.select(good)
             if len(events):

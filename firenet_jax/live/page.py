@@ -5,7 +5,7 @@
     /figures what is measured, as JSON
 
 Only for this machine: it listens on the loopback address, and answers no request that a page of
-somebody else's sent here under another name.
+somebody else's sent here under another name, and shows no pictures in such a page.
 """
 
 import contextlib
@@ -21,6 +21,7 @@ from PIL import Image
 
 QUALITY = 85  # of the JPEGs
 BOUNDARY = "picture"
+AGAIN = 5  # seconds without a new picture
 
 PAGE = """<!doctype html>
 <meta charset="utf-8"><meta name="viewport" content="width=device-width">
@@ -87,10 +88,12 @@ class Board:
             self.changed.notify_all()
 
     def newest(self, seen: int) -> tuple[int, bytes] | None:
-        """Waits for a picture after number `seen` -> (its number, it as JPEG); None: no more."""
+        """Waits for a picture after number `seen` -> (its number, it as JPEG); None: no more.
+
+        After some seconds without one it is the same again: who has left is noticed by sending."""
         with self.changed:
-            self.changed.wait_for(lambda: self.number > seen or self.ended)
-            if self.number <= seen:
+            changed = self.changed.wait_for(lambda: self.number > seen or self.ended, AGAIN)
+            if changed and self.number <= seen:
                 return None
             number, picture, (kept, data) = self.number, self.picture, self.jpeg
         if kept != number:  # outside of the lock: whoever hangs up pictures does not wait for it
@@ -108,16 +111,20 @@ def serve(board: Board, figures: Callable[[], dict], title: str, port: int) -> T
     """
 
     class Handler(BaseHTTPRequestHandler):
+        timeout = 30  # seconds, for a browser that says and takes nothing
+
         def do_GET(self):
             host = self.headers.get("Host", "").rsplit(":", 1)[0]  # no port: 80
             if host not in ("127.0.0.1", "localhost"):
                 self.send_error(403)
             elif self.path == "/":
                 self.answer("text/html; charset=utf-8", page)
+            elif self.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
+                self.send_error(403)  # in a page of somebody else's
             elif self.path == "/figures":
                 self.answer("application/json", json.dumps(figures()).encode())
             elif self.path == "/video":
-                with contextlib.suppress(ConnectionError):  # the browser went away
+                with contextlib.suppress(ConnectionError, TimeoutError):  # the browser went away
                     self.video()
             else:
                 self.send_error(404)
@@ -145,7 +152,7 @@ def serve(board: Board, figures: Callable[[], dict], title: str, port: int) -> T
             pass
 
     escaped = title.replace("&", "&amp;").replace("<", "&lt;")
-    page = PAGE.replace("TITLE", escaped).encode()
+    page = PAGE.replace("TITLE", escaped).encode(errors="backslashreplace")
 
     class Server(ThreadingHTTPServer):
         def handle_error(self, request, client_address):

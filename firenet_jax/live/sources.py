@@ -109,7 +109,7 @@ def udp(host: str, port: int) -> Iterator[bytes]:
                     yield listening.recv(PIECE)
                 except TimeoutError:
                     yield b""
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: no name of a host
         raise RecordingError(f"udp://{host}:{port}: cannot listen there ({error})") from error
 
 
@@ -127,7 +127,7 @@ def tcp(host: str, port: int) -> Iterator[bytes]:
                 if not piece:
                     return
                 yield piece
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: no name of a host
         raise RecordingError(
             f"tcp://{host}:{port}: {error}; start the program that sends events there first"
         ) from error
@@ -155,10 +155,19 @@ def growing(path: Path) -> Iterator[bytes]:
         while True:
             piece = file.read(PIECE)
             if not piece:
-                if os.fstat(file.fileno()).st_size < file.tell():
+                mine = os.fstat(file.fileno())
+                if mine.st_size < file.tell() or not _is_still(path, mine):
                     raise RecordingError(f"{path}: was begun anew by its writer: start again")
                 time.sleep(TICK)
             yield piece
+
+
+def _is_still(path: Path, file: os.stat_result) -> bool:
+    """Whether the path leads to this file, and not to a new one; one that is gone may come."""
+    try:
+        return os.path.samestat(path.stat(), file)
+    except OSError:
+        return True
 
 
 # ---- Bytes to events
@@ -183,8 +192,11 @@ def decoded(pieces: Iterable[bytes], wire: str, datagrams: bool = False) -> Iter
                 f"expected: is --wire right? It may be {', '.join(BINARY)}"
             )
         yield events
-    if rest and wire == "text":  # so may that of a stream
-        yield decode(rest + b"\n")[0]
+    if isinstance(decode, _Text):
+        if rest:  # so may that of a stream
+            yield decode(rest + b"\n")[0]
+        if not decode.whole and decode.refused:
+            raise decode.refused
 
 
 class _Binary:
@@ -221,6 +233,7 @@ class _Text:
 
     def __init__(self):
         self.seconds, self.whole, self.broken = False, 0, 0
+        self.refused: RecordingError | None = None  # the first broken line
 
     def __call__(self, data: bytes) -> tuple[Events, bytes]:
         lines, _, rest = data.rpartition(b"\n")
@@ -250,10 +263,11 @@ class _Text:
         for row in rows:
             (broken if _numbers([row]) is None else kept).append(row)
         whole = self.whole + len(kept)
-        if not whole or self.broken + len(broken) > 1 + whole // 1000:
+        if self.broken + len(broken) > 1 + whole // 1000:
             raise _refused(broken[0])
         if not self.broken:
-            logger.warning("a broken line is left out: %s", _refused(broken[0]))
+            self.refused = _refused(broken[0])
+            logger.warning("a broken line is left out: %s", self.refused)
         self.broken += len(broken)
         return kept
 
@@ -275,11 +289,13 @@ def _numbers(rows: list[list[bytes]]) -> np.ndarray | None:
 
 
 def _events(numbers: np.ndarray | None) -> np.ndarray | None:
-    """None if they cannot be rows of t x y p."""
+    """None if they cannot be rows of t x y p: pixels are whole, polarity is 0 or 1, or -1 or 1."""
     if numbers is None or numbers.shape[1:] != (4,):
         return None
-    t, x, y, _ = np.abs(numbers).T
-    return numbers if (t < 2**53).all() and (np.maximum(x, y) < 2**15).all() else None
+    t, *pixels, p = np.abs(numbers).T
+    pixels = np.stack(pixels)
+    whole = (pixels == np.rint(pixels)).all() and (pixels < 2**15).all()
+    return numbers if (t < 2**53).all() and whole and ((p == 0) | (p == 1)).all() else None
 
 
 # ---- Cameras
