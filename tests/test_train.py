@@ -528,12 +528,12 @@ def test_a_run_resumes_on_the_files_that_it_began_with(tmp_path, ending):
 def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypatch):
     Log(tmp_path, 0).write(1, "validation", {"loss": jnp.float32(3)})
 
-    def killed(path, text, **how):
+    def killed(path, content):
         path.open("w").close()
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(Path, "write_text", killed)
+        patch.setattr(Path, "write_bytes", killed)
         Log(tmp_path, 1)
     assert Log(tmp_path, 1).best() == 3
 
