@@ -374,18 +374,20 @@ def test_a_run_older_than_an_option_goes_on_if_that_stands_at_its_default(tmp_pa
 
 
 def test_another_process_never_sees_half_of_the_settings(tmp_path, monkeypatch):
-    settings, write = Train(output=tmp_path), Path.write_text
+    settings, write, looks = Train(output=tmp_path), Path.write_bytes, []
 
-    def write_with_a_look_in_between(path, text, **how):
-        write(path, text[:10], **how)
+    def write_with_a_look_in_between(path, content):
+        write(path, content[:10])
         with monkeypatch.context() as other:
             other.setattr(train, "is_first", lambda: False)
             train._check_settings(tmp_path, settings)
-        write(path, text, **how)
+        looks.append(path)
+        write(path, content)
 
-    monkeypatch.setattr(Path, "write_text", write_with_a_look_in_between)
+    monkeypatch.setattr(Path, "write_bytes", write_with_a_look_in_between)
     train._keep_settings(tmp_path, settings)
     assert [path.name for path in tmp_path.iterdir()] == ["settings.json"]
+    assert len(looks) == 1
 
 
 def test_weights_that_expect_other_tensors_are_refused(tmp_path):
