@@ -922,6 +922,7 @@ def test_a_clean_sensor_among_faulty_ones_is_the_papers(textures):
 
 @pytest.mark.slow
 @pytest.mark.reference
+@pytest.mark.optimised
 def test_the_published_weights_reconstruct_simulated_photographs(reference):
     from skimage.metrics import structural_similarity
 
