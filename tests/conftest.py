@@ -48,8 +48,8 @@ COMPILED_QUICKLY = (
     "test_dataset.py", "test_demo.py", "test_e2vid.py", "test_export.py", "test_losses.py",
     "test_lpips.py", "test_metrics.py", "test_native.py", "test_network.py", "test_notebooks.py",
     "test_pipeline.py", "test_reconstruct_at.py", "test_reconstruction.py", "test_scenes.py",
-    "test_sensor.py", "test_simulated_images.py", "test_snippets.py", "test_train.py",
-    "test_trial.py",
+    "test_sensor.py", "test_simulated_images.py", "test_snippets.py", "test_stages.py",
+    "test_train.py", "test_trial.py",
 )  # fmt: skip
 
 # With `-n 2` a file's tests share data and programs in one process, but each of these may run in
