@@ -58,7 +58,8 @@ class Counts:
 
     @property
     def outside(self) -> str:
-        return f"{self.early} before its first event, {self.late} after its last one"
+        """Of the events that are reconstructed, which may be a part of the recording."""
+        return f"{self.early} before the first event, {self.late} after the last"
 
 
 def steps(

@@ -19,8 +19,9 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise SettingsError(f"sensor size {text!r}: expected WIDTHxHEIGHT, such as 240x180")
+    # Python makes no number of more than 4,300 digits.
+    if not all(side.isdecimal() and len(side) <= 20 and int(side) for side in (width, height)):
+        raise SettingsError(f"sensor size {text[:60]!r}: expected WIDTHxHEIGHT, such as 240x180")
     if max(int(width), int(height)) > LONGEST_SIDE:
         raise SettingsError(f"sensor size {text}: a side is at most {LONGEST_SIDE} pixels")
     return int(height), int(width)

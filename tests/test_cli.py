@@ -392,11 +392,15 @@ def test_words_that_cannot_be_read_are_said_without_pythons(here, capsys, monkey
 
 def test_colours_of_a_sensor_that_says_it_is_grey(here, capsys):
     words = np.array([[10, 1 | 2 << 14], [20, 3 | 4 << 14]], "<u4").tobytes()
-    (here / "a.dat").write_bytes(b"% Version 2\n% Width 24\n% Height 20\n\x00\x08" + words)
-    code, _, error = firenet(capsys, "reconstruct a.dat -o out -c weights.npz --color")
+    (here / "grey.dat").write_bytes(b"% Version 2\n% Width 24\n% Height 20\n\x00\x08" + words)
+    code, _, error = firenet(capsys, "reconstruct grey.dat -o out -c weights.npz --color")
     assert code == 1 and "sees no colours" in error and not list(here.glob("out*"))
     (here / "a.bin").write_bytes(bytes([1, 2, 0x80, 0, 10]))
     assert open_recording(here / "a.bin").grey and not open_recording(here / "a.txt").grey
+    # ... and does not keep others from being done.
+    code, _, error = firenet(capsys, "reconstruct grey.dat a.txt -o out -c weights.npz --color")
+    assert code == 1 and "sees no colours" in error and "the other recordings are done" in error
+    assert list(here.glob("out/*/frame*"))
 
 
 def test_which_recordings_say_that_their_sensor_is_grey(recordings):

@@ -400,7 +400,7 @@ def test_seconds_are_no_times(weights, recording, caplog):
     assert len(list(images_at(weights, recording, [0, FIRST, 2**60]))) == 1
     assert not caplog.text  # where some are outside and some are not
     assert not list(images_at(weights, recording, [0, 2**60]))
-    assert "1 before its first event, 1 after its last one" in caplog.text
+    assert "1 before the first event, 1 after the last" in caplog.text
 
 
 def test_a_grid_can_be_used_again_and_one_that_begins_too_late_is_told(weights, recording, caplog):
@@ -409,7 +409,7 @@ def test_a_grid_can_be_used_again_and_one_that_begins_too_late_is_told(weights, 
     np.testing.assert_array_equal(*(np.concatenate([t for t, _ in each]) for each in found))
     assert found[0] and not caplog.text
     assert not list(images_at(weights, recording, grid(2 * FIRST, 1000), chunk=4, events=90))
-    assert "0 before its first event, 1 after its last one" in caplog.text
+    assert "0 before the first event, 1 after the last" in caplog.text
 
 
 def at_times(t):

@@ -768,7 +768,12 @@ def test_real_time_is_the_default_and_each_event_is_counted_once(tmp_path, weigh
     ):
         with pytest.raises(SettingsError, match=said):
             settings(weights, (recording,), tmp_path / name, **choice)
-    with pytest.raises(OutputError, match="cannot write .avi files"):
-        run(settings(weights, (recording,), tmp_path / "a.avi", fps=25.0))
+    for paths in ((recording,), (recording, recording)):
+        for name in ("a.avi", "a.MP4"):
+            with pytest.raises(OutputError, match=f"cannot write {Path(name).suffix} files"):
+                run(settings(weights, paths, tmp_path / name, fps=25.0))
+    assert not (tmp_path / "a.avi").exists()
+    with pytest.raises(SettingsError, match="--warm-up has no effect beside --no-recurrent"):
+        settings(weights, (recording,), tmp_path / "a", warm_up=9, network=Network(recurrent=False))
     run(settings(weights, (recording,), tmp_path / "one", windows=Windows(events=3000)))
     assert "1 picture of 3,000 events" in capsys.readouterr().out

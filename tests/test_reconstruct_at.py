@@ -136,7 +136,7 @@ def test_times_outside_of_a_recording(tmp_path, weights, caplog):  # noqa: F811
         (tmp_path / name).write_text(text)
     some, none = (Times(at=tmp_path / n, since="zero") for n in ("some", "none"))
     run(settings(weights, (recording,), tmp_path / "out", times=some))
-    assert "times without an image: 1 before its first event, 2 after its last one" in caplog.text
+    assert "times without an image: 1 before the first event, 2 after the last" in caplog.text
     assert stamps_of(tmp_path / "out")[:, 1].tolist() == [500_000]
     with pytest.raises(RecordingError, match="no image is wanted while it lasts"):
         run(settings(weights, (recording,), tmp_path / "other", times=none))

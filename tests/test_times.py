@@ -93,6 +93,14 @@ def test_a_time_that_is_there_twice_is_said(tmp_path, recording, caplog):
         found = read(tmp_path, recording, "0.3\n0.1\n0.1\n0.2\n", unit="s", since="start")
     assert found.tolist() == [5_100_000, 5_200_000, 5_300_000]
     assert "1 time of before: one image each" in caplog.text
+    assert "its times are not in order" in caplog.text
+
+
+def test_a_unit_that_is_not_that_of_the_file(tmp_path, recording):
+    assert read(tmp_path, recording, "5.25s\n", unit="s", since="zero").tolist() == [5_250_000]
+    for text in ("5.25s\n", "# timestamp [s]\n5.25\n"):
+        with pytest.raises(RecordingError, match="says that its times are in s: leave out --unit"):
+            read(tmp_path, recording, text, unit="ms", since="zero")
 
 
 def test_times_of_today_keep_their_microseconds(tmp_path):
@@ -126,6 +134,8 @@ def test_files_that_are_of_no_use(tmp_path, recording, text, said):
 def test_numbers_beyond_all_times_lie_outside(tmp_path, recording):
     found = read(tmp_path, recording, "5.25\n5.5\n1e999999999\n")
     assert found[:2].tolist() == [5_250_000, 5_500_000] and found[2] == MAX_TIME
+    found = read(tmp_path, recording, "5.5e-9999999999999999999\n5.25\n", unit="s", since="zero")
+    assert found.tolist() == [0, 5_250_000]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pipes with names")

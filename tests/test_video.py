@@ -289,6 +289,14 @@ def test_the_last_picture_stays_as_long_as_the_one_before(tmp_path, kind, step):
     assert shown == pytest.approx([step] * 7)
 
 
+@pytest.mark.parametrize("fps, count", [(3000, 101), (5000, 7), (10_000, 3)])
+def test_a_video_of_any_rate_shows_all_of_its_pictures(tmp_path, fps, count):
+    pictures = np.random.default_rng(0).integers(0, 256, (count, 24, 32)).astype(np.uint8)
+    write_video(tmp_path / "a.mp4", pictures, fps)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert len(list(container.decode(video=0))) == count
+
+
 @pytest.mark.parametrize("name", ["a.partial.mp4", "a.partial"])
 def test_an_output_is_not_what_another_is_made_in(tmp_path, name):
     with pytest.raises(OutputError, match=f"{name}: .partial names what is not finished"):

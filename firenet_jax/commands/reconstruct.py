@@ -136,6 +136,11 @@ class Reconstruct:
             )
         if self.warm_up < 0:
             raise SettingsError(f"warm-up is {self.warm_up}, but must be 0 or more windows")
+        if not self.network.recurrent and self.warm_up not in (0, WARM_UP):
+            raise SettingsError(
+                "--warm-up has no effect beside --no-recurrent, which remembers nothing: leave it "
+                "out"
+            )
         if self.network.pad < 1:
             raise SettingsError(f"pad is {self.network.pad}, but pads to a multiple of 1 or more")
         if not self.recordings:
@@ -164,7 +169,7 @@ class Reconstruct:
 def _check_idle(settings: Reconstruct) -> None:
     """Raises SettingsError for what would have no effect on this kind of output."""
     suffix = settings.output.suffix
-    if suffix not in video.WHOLE and video.like_a_file(suffix):
+    if suffix not in video.WHOLE and video.like_a_file(suffix) and not settings.output.is_dir():
         return  # nothing can be written there, which is said later
     idle = [] if suffix in video.VIDEOS else ["fps", "speed"]
     idle += [] if suffix in (".bag", ".ros2") else ["topic", "frame_id"]
@@ -242,9 +247,12 @@ def do_all(jobs: list[Job], settings: Reconstruct, weights: Weights, outcome: Ou
 
 
 def plan(recordings: tuple[Path, ...], output: Path) -> list[Path]:
-    """The output of each recording: `output` itself if there is only one recording."""
+    """The output of each recording: `output` itself if there is only one recording.
+
+    Raises OutputError for names that several cannot have."""
     if len(recordings) == 1:
         return [video.followed(output)]
+    video.check_kind(output)
     stems = [_stem(named(path)) for path in recordings]
     if output.suffix not in video.WHOLE:
         stems = [_of_a_folder(stem) for stem in stems]
@@ -290,19 +298,20 @@ def job_of(
         logger.warning("%s", error)
         outcome.failed[output] = error
         return None
-    if settings.network.color and recording.grey:
-        raise RecordingError(
-            f"{path}: says that its sensor sees no colours, --color would invent some: leave it out"
-        )
     windows, speed = windows_for(recording, settings)
     choice = settings.hot_pixels
     hot = functools.cache(lambda: None if choice is None else hot_pixels(choice, recording))
     try:
+        if settings.network.color and recording.grey:
+            raise RecordingError(
+                f"{path}: says that its sensor sees no colours, --color would invent some: leave "
+                "it out"
+            )
         times = times_of(settings.times, recording, filtered(recording, settings, hot))
+        record = describe(dataclasses.replace(settings, windows=windows), recording, weights, times)
     except RecordingError as error:
         outcome.failed[output] = error
         return None
-    record = describe(dataclasses.replace(settings, windows=windows), recording, weights, times)
     if is_done(output, record):
         logger.warning(
             "%s: done by the run that this one continues (without %s it is made again)",

@@ -142,6 +142,8 @@ def _triggers(wanted: Times, recording: Recording) -> np.ndarray:
 
 def _from_file(path: Path, wanted: Times, recording: Recording) -> np.ndarray:
     numbers, unit, since_start = read_times(path)
+    if wanted.unit and unit and unit != wanted.unit:
+        raise RecordingError(f"{path}: says that its times are in {unit}: leave out --unit")
     unit = wanted.unit or unit
     since_start = since_start if wanted.since is None else wanted.since == "start"
     units = [unit] if unit else [*UNITS] if whole_numbers(numbers) else ["s", "ms"]
@@ -173,6 +175,8 @@ def _from_file(path: Path, wanted: Times, recording: Recording) -> np.ndarray:
             path, counted(len(times), "time"), UNIT_NAMES[name],
             "since the first event" if relative else "on the recording's clock",
         )  # fmt: skip
+    if (np.diff(times) < 0).any():
+        logger.warning("%s: its times are not in order, the images will be", path)
     if again := len(times) - len(once := np.unique(times)):
         logger.warning("%s: %s of before: one image each", path, counted(again, "time"))
     return once
@@ -255,7 +259,7 @@ def _scaled(numbers: list[str], unit: str) -> np.ndarray:
         try:
             time = Decimal(number) * UNITS[unit]
         except ArithmeticError:  # an exponent of millions
-            return MAX_TIME
+            return 0 if "e-" in number.lower() else MAX_TIME
         return int(min(max(time.to_integral_value(), -MAX_TIME), MAX_TIME))
 
     return np.array([scaled(number) for number in numbers], np.int64)

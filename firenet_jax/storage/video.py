@@ -79,15 +79,20 @@ def like_a_file(suffix: str) -> bool:
     return suffix.lower() in (*WHOLE, *OTHER_FILES) or LIKE_A_FILE.fullmatch(suffix) is not None
 
 
-def check_output(path: Path, overwrite: bool) -> None:
-    """Raises OutputError if this cannot be an output, or something is there that must not or cannot
-    be replaced. Makes the folder that it will be in."""
+def check_kind(path: Path) -> None:
+    """Raises OutputError if this is the name of a file that is none of our outputs."""
     happens = path.is_dir() and path.suffix.lower() not in (*WHOLE, *OTHER_FILES)
     if path.suffix not in WHOLE and like_a_file(path.suffix) and not happens:
         raise OutputError(
             f"{path}: cannot write {path.suffix} files: name a folder (for png), .mp4, .gif, .h5, "
             ".bag or .ros2"
         )
+
+
+def check_output(path: Path, overwrite: bool) -> None:
+    """Raises OutputError if this cannot be an output, or something is there that must not or cannot
+    be replaced. Makes the folder that it will be in."""
+    check_kind(path)
     if path.exists() and not (path.is_file() or path.is_dir()):  # a file would take its place
         raise OutputError(f"{path} is a pipe or device: choose a name for a file or folder")
     folder = path.suffix not in WHOLE or path.suffix == ".ros2"
@@ -254,8 +259,8 @@ class VideoWriter:
         self.path, self.partial = path, partial_name(path)
         self.rate = Fraction(fps or USUAL_RATE).limit_denominator(1000)
         self.tick, self.least = 1 / self.rate, 1  # seconds; ticks between two pictures
+        gif = path.suffix == ".gif"
         if fps is None:
-            gif = path.suffix == ".gif"
             self.tick = Fraction(1, GIF_CLOCK if gif else MP4_CLOCK)
             self.least = 2 if gif else MP4_CLOCK // 1000
         self.speed, self.timed = speed, fps is None
@@ -266,7 +271,10 @@ class VideoWriter:
         with writing(path):
             self.held = open_alone(self.partial, path)
             # absolute, for FFmpeg takes what precedes a colon for a protocol
-            self.container = av.open(str(self.partial.absolute()), "w")
+            # An mp4 says how long it is in ticks of a clock of its own, by default of a thousand a
+            # second: what is shown after the last whole one was lost.
+            clock = {} if gif else {"movie_timescale": str(MP4_CLOCK)}
+            self.container = av.open(str(self.partial.absolute()), "w", options=clock)
         self.stream: Any = None
         self.waiting: list = []  # packets, until one sees how long the last picture is shown
         self.filter: Graph | None = None
