@@ -199,7 +199,7 @@ def checked(
     and for damage before the first event; with `strict`, for any bad row or damage. `place(row)`
     names a row (counted from 0 over the whole recording) in the file's own terms, such as "line 7".
     """
-    rows, dropped, first_error = 0, 0, None
+    rows, dropped, first_error, said = 0, 0, None, []
     held, before = Events.empty(), -MAX_TIME  # a chunk's end, and the last time before it
     try:
         for chunk in with_damage(chunks):
@@ -207,8 +207,7 @@ def checked(
                 yield from filter(len, [held])
                 if strict or rows == dropped:
                     raise chunk
-                what = f"what comes before is read: {counted(rows - dropped, 'event')}"
-                say(f"{chunk}; {what}", rows)
+                said = [f"{chunk}; what comes before is read: {counted(rows - dropped, 'event')}"]
                 return
             events = chunk if isinstance(chunk, Events) else chunk.events
             if len(events) == 0:
@@ -237,7 +236,9 @@ def checked(
         yield from filter(len, [held])
     finally:
         if dropped:
-            say(f"{first_error}; left out: {dropped:,} of {counted(rows, 'event')}", rows)
+            said += [f"{first_error}; left out: {dropped:,} of {counted(rows, 'event')}"]
+        if said:
+            say("; ".join(said), rows)
 
 
 def with_damage(items: Iterable[Item]) -> Iterator[Item | RecordingError]:

@@ -191,6 +191,19 @@ def test_damage_ends_the_reading_after_what_comes_before_it(strict, before):
     assert sum(map(len, seen)) == before
 
 
+def test_damage_and_what_was_left_out_are_both_said():
+    def chunks():
+        yield rows_of(many(0), 7)
+        raise RecordingError("torn")
+
+    said = []
+    found = checked(chunks(), Path("a"), 18, 24, strict=False, say=lambda *what: said.append(what))
+    assert sum(map(len, found)) == 1999
+    ((sentence, rows),) = said
+    assert rows == 2000 and "torn; what comes before is read: 1,999 events" in sentence
+    assert "what the file says; left out: 1 of 2,000 events" in sentence
+
+
 def test_a_first_look_ends_at_damage_and_raises_it_only_if_there_is_nothing_else():
     def chunks(*before):
         yield from before

@@ -37,6 +37,7 @@ from firenet_jax.readers import (
     raw,
     rosbag,
     text,
+    torn_bag,
 )
 
 T = np.array([1000, 1500, 1500, 20_000, 3_000_007])  # microseconds
@@ -162,6 +163,14 @@ def test_unwrap():
     pieces = [*first, *readers.unwrap(wrapped[3:], 8, int(first[-1]))]
     np.testing.assert_array_equal(pieces, expected)
     assert readers.unwrap(np.array([], np.int64), 8, 5).size == 0
+    # One value that is damaged is no turn, before the first wrap and after it; a pause may be one.
+    for before, wrong in ((0, 250), (0, 129), (1, 200)):
+        spike = np.array([20, 21, wrong, wrong, 21, 30]) + 256 * before
+        found = readers.unwrap(spike % 256, 8, 20 + 256 * before)
+        np.testing.assert_array_equal(found, spike)
+    pause = readers.unwrap(np.array([20, 200, 10, 150, 15]), 8, 0)
+    np.testing.assert_array_equal(pause, [20, 200, 266, 406, 527])
+    assert readers.unwrap(np.array([250, 0]), 8, 0).tolist() == [250, 256]  # the first may be any
     late = readers.unwrap(np.array([65530, 3, 65534, 65534, 9, 40_000, 1]), 16, 0)  # once round
     assert late.tolist() == [65530, 65539, 65534, 65534, 65545, 105_536, 131_073]
 
@@ -378,6 +387,21 @@ def test_what_comes_before_damaged_compression_is_read(tmp_path, rows, damage):
     assert len(times) > 0.4 * rows
 
 
+@pytest.mark.parametrize("rows", [60_000, 360_000])
+def test_what_comes_before_damage_in_a_zip_is_read(tmp_path, rows):
+    content = "".join(f"{i / 1e6:.6f} {i * 7919 % 320} {i % 180} {i % 2}\n" for i in range(rows))
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.txt", content)
+    whole = (tmp_path / "a.zip").read_bytes()
+    at = len(whole) * 9 // 10
+    path = write(tmp_path / "a.zip", whole[:at] + b"\xff" * 64 + whole[at + 64 :])
+    count = 0
+    with contextlib.suppress(RecordingError):  # what is unpacked may still be, to other text
+        for events in open_recording(path, (240, 320)).events():
+            count += len(events)
+    assert count > 0.8 * rows - 4000
+
+
 @pytest.mark.parametrize(
     "content, said",
     [
@@ -477,6 +501,23 @@ def test_ecd_without_frames(tmp_path, caplog):
     assert open_recording(folder, (3, 4)).frames is None
 
 
+def test_ecd_whose_pictures_are_damaged(tmp_path, caplog):
+    """The events can be read, and an error of any kind names the picture."""
+    folder = ecd_folder(tmp_path)
+    whole = (folder / "images/a.png").read_bytes()
+    for place in range(len(whole)):
+        write(folder / "images/a.png", whole[:place] + bytes([5]) + whole[place + 1 :])
+        with contextlib.suppress(RecordingError):
+            open_recording(folder, (3, 4)).frames.read(0)
+    write(folder / "images/a.png", whole[:11] + b"\5" + whole[12:])
+    assert events_of(folder, None).x.tolist() == [0, 3]
+    assert "images/a.png: cannot be read" in caplog.text and "4x3 inferred" in caplog.text
+    caplog.clear()
+    assert events_of(folder, (3, 4)).x.tolist() == [0, 3]
+    write(folder / "images.txt", "0.001 images/a.png\n1e300 images/b.png\n")
+    refused(folder, "images.txt, frame 2: its time is 1e+300")
+
+
 def test_ecd_zip_without_its_pictures(tmp_path, caplog):
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         for name, content in ecd_files().items():
@@ -553,6 +594,14 @@ def test_hdf5_event_cnn_minimal(tmp_path):
     check(write_cnn(tmp_path / "no_suffix"))
     recording = open_recording(write_cnn(tmp_path / "b.h5", size=None, x=X % 4, y=Y % 3))
     assert (recording.height, recording.width) == (3, 4)  # of the frames
+    with h5py.File(path, "a") as file:  # as MATLAB writes numbers
+        for name, image in file["images"].items():
+            image.attrs["timestamp"] = np.array([int(name[-1]) / 10])
+    check_frames(path, [0, 100_000])
+    with h5py.File(path, "a") as file:
+        for image in file["images"].values():
+            image.attrs["timestamp"] = [0.1, 0.2]
+    refused(path, "timestamps of shape (2,), not one")
 
 
 def test_hdf5_dsec(tmp_path):
@@ -800,6 +849,11 @@ def test_wrong_npy(tmp_path):
     folder = write_npy(tmp_path / "c", EVREAL, metadata="{")
     refused(folder, "metadata.json: cannot be read", size=None)
     folder = write_npy(tmp_path / "d", MEMMAP)
+    np.save(folder / "t.npy", np.zeros((1, 0)))
+    refused(folder, "its columns do not fit together")
+    np.savez(tmp_path / "other.npz", a=T)
+    (tmp_path / "other.npz").rename(tmp_path / "other.npy")
+    refused(tmp_path / "other.npy", "other.npy: cannot be read (an .npz of another name)")
     write(folder / "t.npy", (folder / "t.npy").read_bytes()[:-8])
     refused(folder, "t.npy: cannot be read")
     np.save(folder / "t.npy", np.array([{}], object), allow_pickle=True)
@@ -960,6 +1014,9 @@ def test_evt3_time():
     words = [high(50), low(9), row(0), single(0), low(4), single(1), high(49), low(1), single(2)]
     assert [event[0] for event in decoded(words)] == [(50 << 12) + 9] * 3
     assert decoded([*words[:4], high(30), low(0)], [single(3)])[-1] == (30 << 12, 3, 0, 0)
+    # ... and so they are after one time that is damaged
+    latest, t = evt3.without_jitter(7, np.array([100, 90, 1 << 24, 110, 105, 120, 115]))
+    assert t.tolist() == [100, 100, 1 << 24, 110, 110, 120, 120] and latest == 120
 
 
 # ---------------------------------------------------------------- camera files
@@ -1459,6 +1516,46 @@ def test_mcap_that_was_broken_off(tmp_path, caplog, how):
         refused(path, "it has no index, so it ends early", size=None)
 
 
+@pytest.mark.parametrize("encoding", ["evt3", "libcaer_cmp"])
+def test_packets_before_a_damaged_one_are_read(new_bag, caplog, encoding):
+    """Although many are decoded at once."""
+    path, bag = new_bag("a")
+    libcaer_words = np.array([0x2005, 0x3803], "<u2").tobytes()
+    for k in range(20):
+        data = payload(k) if encoding == "evt3" else libcaer_words
+        bag.packet(EPOCH + 1024 * k, data[: -1 if k == 15 else None], encoding, base=10**6 * k)
+    bag.close()
+    assert len(events_of(path, (240, 320))) == 15 * (10 if encoding == "evt3" else 1)
+    assert "bytes, which are no whole words" in caplog.text
+
+
+@pytest.mark.parametrize("chunk", [800, 100_000])
+def test_a_bag_that_was_broken_off(tmp_path, monkeypatch, chunk):
+    """Of its last chunk the beginning counts; no picture needs a look at all that precedes it."""
+    bag = Bag(tmp_path / "a.bag", 1)
+    bag.writer.chunk_threshold = chunk
+    for k in range(40):
+        bag.packet(EPOCH + 1000 * k, payload(k))
+        bag.image("/cam", EPOCH + 1000 * k, FRAME + k)
+    bag.close()
+    whole = (tmp_path / "a.bag").read_bytes()
+    monkeypatch.setattr(torn_bag, "STRIDE", 64)
+    path = write(tmp_path / "a.bag", whole[: len(whole) // 2])
+    recording = open_recording(path)
+    count = len(recording.frames.times)
+    assert count >= 12 and sum(map(len, recording.events())) in (10 * count, 10 * count + 10)
+    read, inside = [], torn_bag.Torn._inside
+    monkeypatch.setattr(
+        torn_bag.Torn,
+        "_inside",
+        lambda self, file: (read.append(message[1]) or message for message in inside(self, file)),
+    )
+    for k in reversed(range(count)):
+        read.clear()
+        np.testing.assert_array_equal(recording.frames.read(k), FRAME + k)
+        assert len(read) <= chunk // 30  # each of a chunk is counted inside and outside
+
+
 @pytest.mark.parametrize("named", [True, False])
 def test_mcap_in_parts_and_without_a_storage_plugin(tmp_path, named):
     """The metadata name the parts in their order; else that of their names counts."""
@@ -1710,6 +1807,22 @@ def test_bags_against_the_sums_of_the_formats_own_tests(recordings, monkeypatch)
     assert (triggers.times - events.t[0]).tolist() == (times - first).tolist()
     events = events_of(recordings / "ros2_mcap", None)
     assert (int((~events.p).sum()), int(events.p.sum())) == (360_223, 211_043)
+
+
+def test_a_damaged_first_frame_does_not_keep_the_events_back(recordings, tmp_path):
+    """Whichever of its bytes is wrong."""
+    path = recordings / "davis346_frames.aedat4"
+    whole, layout = path.read_bytes(), aedat4._layout(path)
+    with open(path, "rb") as file:
+        offset, size = next(aedat4._packets(path, file, layout, layout.frames))
+        head = aedat4._unpacked(file, layout, offset, size)
+    count = sum(map(len, open_recording(path).events()))
+    for place in (4, 8, 12, 14, 16, 18, 20, 24, 28):
+        data = struct.pack("<I", len(head)) + head[:place] + b"\xfe\x7f" + head[place + 2 :]
+        packed = pyarrow.compress(data, "lz4", asbytes=True)
+        start = whole[: offset - 8] + struct.pack("<ii", layout.frames, len(packed))
+        damaged = write(tmp_path / "a.aedat4", start + packed + whole[offset + size :])
+        assert sum(map(len, open_recording(damaged).events())) == count
 
 
 def test_damaged_samples(recordings, tmp_path):

@@ -242,9 +242,11 @@ def microseconds(seconds: np.ndarray) -> np.ndarray:
 def frame_times(path: Path, times: np.ndarray) -> np.ndarray:
     """(F,) microseconds where integer, seconds where floating -> (F,) int64 microseconds.
 
-    Raises RecordingError for a time that is not finite."""
-    if not np.isfinite(times).all():
-        frame = int(np.argmin(np.isfinite(times)))
+    Raises RecordingError for a time that is not finite, or that no clock tells."""
+    latest = MAX_TIME / 1e6 if times.dtype.kind == "f" else MAX_TIME
+    right = (-latest < times) & (times < latest)  # not NaN
+    if not right.all():
+        frame = int(np.argmin(right))
         raise RecordingError(f"{path}, frame {frame + 1}: its time is {times[frame]}")
     return times.astype(np.int64) if times.dtype.kind in "iu" else microseconds(times)
 
@@ -297,6 +299,16 @@ def to_events(
     return Rows(Events.of(microseconds(t) if t.dtype.kind == "f" else t, x, y, p), bad, error)
 
 
+def size_of(frames: Frames | None) -> tuple[int, int] | None:
+    """(height, width) of the first frame; None without any. Where it cannot be read a warning says
+    so: the events may still be."""
+    try:
+        return None if frames is None else frames.read(0).shape
+    except RecordingError as error:
+        logger.warning("%s", error)
+        return None
+
+
 def to_frame(picture: np.ndarray, path: Path) -> np.ndarray:
     """A picture as a file holds it, (H, W) or (H, W, 1, 3 or 4), uint8 or uint16 -> (H, W) uint8.
 
@@ -320,14 +332,25 @@ def to_frame(picture: np.ndarray, path: Path) -> np.ndarray:
 def unwrap(counter: np.ndarray, bits: int, last: int) -> np.ndarray:
     """(N,) values of a counter of so many bits, which wraps around -> int64 that keeps growing.
 
-    last: its unwrapped value just before. Falls of more than half its range are wraps; smaller
-    ones are left as they are, for `events.checked` to judge.
+    last: its unwrapped value just before. Falls of more than half its range are wraps, but where
+    they lead back to what preceded a rise as large, after a damaged value; smaller ones are left as
+    they are, for `events.checked` to judge.
     """
     counter = np.asarray(counter, np.int64)
     whole = 1 << bits
-    steps = np.diff(counter, prepend=last & (whole - 1))
-    turns = (last >> bits) + np.cumsum(steps < -(whole // 2))
+    before = np.append(last & (whole - 1), counter[:-1])
+    steps = counter - before
+    wraps = steps < -(whole // 2)
+    turns = (last >> bits) + np.cumsum(wraps)
     back = (steps > whole - (whole >> 8)) & (turns > 0)  # late, from before the last wrap
+    if wraps.any():
+        rises = np.flatnonzero((steps > whole // 2) & ~back)
+        rises = rises[rises > 0]  # the first value may be any
+        falls = np.flatnonzero(wraps)
+        latest = np.searchsorted(rises, falls) - 1  # the last rise before each fall
+        since = counter[falls] - before[rises[latest]] if rises.size else np.full(falls.shape, -1)
+        wraps[falls[(latest >= 0) & (since >= 0) & (since < whole >> 8)]] = False
+        turns = (last >> bits) + np.cumsum(wraps)
     return counter + ((turns - np.cumsum(back)) << bits)
 
 

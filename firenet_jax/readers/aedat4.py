@@ -14,6 +14,7 @@ cameras the first is read. Each offset is checked before it is followed. Librari
 are not used: they end the whole process at a damaged file (faery), or are large.
 """
 
+import contextlib
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,7 +25,7 @@ import numpy as np
 import pyarrow as pa
 
 from firenet_jax.errors import RecordingError
-from firenet_jax.events import Frames
+from firenet_jax.events import MAX_TIME, Frames
 from firenet_jax.readers import Source, aedat, all_triggers, joined, reading, to_chunks, to_frame
 
 MAGIC = b"#!AER-DAT4.0\r\n"
@@ -262,16 +263,20 @@ def _frames(path: Path, layout: Layout) -> Frames | None:
 
 def _is_grey(path: Path, layout: Layout, stream: int) -> bool:
     """Whether the first frame has one channel: cameras with a colour filter array write more."""
-    with open(path, "rb") as file:
+    with open(path, "rb") as file, contextlib.suppress(RecordingError, *DAMAGED):
         offset, size = next(_packets(path, file, layout, stream))
         data = _unpacked(file, layout, offset, size, HEAD)
-    return _field(data, _root(data), 5, "b") == 0
+        return _field(data, _root(data), 5, "b") == 0
+    return False
 
 
 def _time(data: bytes) -> int:
     table = _root(data)
     begin, end = (_field(data, table, number, "q") for number in (3, 4))
-    return (begin + end) // 2 if begin and end else _field(data, table, 0, "q")
+    time = (begin + end) // 2 if begin and end else _field(data, table, 0, "q")
+    if abs(time) >= MAX_TIME:
+        raise ValueError(f"a frame at {time} us")
+    return time
 
 
 def _frame(path: Path, layout: Layout, packet: tuple[int, int]) -> np.ndarray:

@@ -21,6 +21,7 @@ from firenet_jax.readers import CHUNK, Source, to_chunks, unwrap
 
 TYPES = (0x00, 0x0C)
 VERSIONS = {0: (9, 8), 1: (9, 8), 2: (14, 14)}  # bits of x, and of y
+SIDE = r"(\d{1,9})"  # Python makes no number of more than 4,300 digits
 
 
 def matches(path: Path) -> bool:
@@ -39,7 +40,7 @@ def read(path: Path) -> Source:
             f"{path}: holds entries of type 0x{kind[0]:02X} and {kind[1]} bytes, expected 0x00 or "
             "0x0C, which are events, and 8"
         )
-    version = re.search(r"^%\s*Version[ :=]+(\d+)", header, re.M)
+    version = re.search(r"^%\s*Version[ :=]+(\d{1,9})", header, re.M)
     version = int(version[1]) if version else 0
     if version not in VERSIONS:
         raise RecordingError(f"{path}: is of version {version}, expected 0, 1 or 2")
@@ -72,10 +73,10 @@ def read_header(file: BufferedReader) -> str:
 
 def header_size(header: str) -> tuple[int, int] | None:
     """`% geometry 640x480`, `% format EVT3;height=480;width=640`, or `% Width 640` -> (480, 640)"""
-    if match := re.search(r"geometry[ =:](\d+)x(\d+)", header, re.I):
+    if match := re.search(rf"geometry[ =:]{SIDE}x{SIDE}", header, re.I):
         return int(match[2]), int(match[1])
     sides = "height", "width"
-    height, width = (re.search(rf"\b{side}[ :=]+(\d+)", header, re.I) for side in sides)
+    height, width = (re.search(rf"\b{side}[ :=]+{SIDE}", header, re.I) for side in sides)
     return (int(height[1]), int(width[1])) if height and width else None
 
 

@@ -19,7 +19,7 @@ from PIL import Image
 
 from firenet_jax.errors import RecordingError, logger
 from firenet_jax.events import Frames
-from firenet_jax.readers import Source, microseconds, reading, text, to_frame
+from firenet_jax.readers import Source, frame_times, reading, size_of, text, to_frame
 
 MAX_BYTES = 1 << 26  # bytes of images.txt, and of a picture
 
@@ -36,7 +36,7 @@ def read(path: Path) -> Source:
     else:
         source = text.read(path, f"{_folder_in(path)}events.txt")
     frames = _frames(path)
-    size = frames.read(0).shape if frames and source.size is None else source.size
+    size = source.size or size_of(frames)
     return replace(
         source,
         format="ECD folder" if path.is_dir() else "ECD zip",
@@ -98,7 +98,9 @@ def _frames(path: Path) -> Frames | None:
     if not _holds(path, names[0]):
         logger.warning("%s: images.txt names %s, which is not there: no frames", path, names[0])
         return None
-    return Frames(microseconds(np.array(times)), lambda i: _frame(path, names[i]))
+    return Frames(
+        frame_times(path / "images.txt", np.array(times)), lambda i: _frame(path, names[i])
+    )
 
 
 def _holds(path: Path, name: str) -> bool:
@@ -108,9 +110,7 @@ def _holds(path: Path, name: str) -> bool:
 
 
 def _frame(path: Path, name: str) -> np.ndarray:
-    # OSError: not in the folder, or not a picture
-    bomb = Image.DecompressionBombError
-    with reading(path / name, OSError, SyntaxError, bomb):
+    with reading(path / name, Exception):  # Pillow raises every kind for damaged bytes
         with Image.open(io.BytesIO(_bytes(path, name))) as picture:
             if picture.mode.startswith("I"):  # 16 bits, which conversion would cut off at 255
                 return to_frame(np.asarray(picture).astype(np.uint16), path)

@@ -16,6 +16,7 @@ between them. There is no loop over words: the running count of the words of a k
 each word, the index of the last one so far.
 """
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -61,8 +62,13 @@ def decode(state: State, words: np.ndarray) -> tuple[State, tuple[np.ndarray, ..
 
 
 def without_jitter(latest: int, t: np.ndarray) -> tuple[int, np.ndarray]:
-    """The latest time before them, (N,) int64 -> the latest one, the times without small falls."""
-    highest = np.maximum.accumulate(np.append(latest, t))
+    """The latest time before them, (N,) int64 -> the latest one, the times without small falls. A
+    larger fall begins anew: what preceded it may have been damaged."""
+    highest = np.append(latest, t)
+    falls = np.flatnonzero(np.diff(highest) < -JITTER) + 1
+    for start, stop in itertools.pairwise([0, *falls.tolist(), len(highest)]):
+        part = highest[start:stop]
+        np.maximum.accumulate(part, out=part)
     return int(highest[-1]), np.where(highest[1:] - t <= JITTER, highest[1:], t)
 
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Frames, Rows
-from firenet_jax.readers import Source, extra, frame_times, in_chunks, reading, to_frame
+from firenet_jax.readers import Source, extra, frame_times, in_chunks, reading, size_of, to_frame
 from firenet_jax.storage.files import check_readable
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -51,10 +51,10 @@ def read(path: Path) -> Source:
         size = file.attrs.get("sensor_resolution")
         if size is not None:
             size = _resolution(path, size)
-        elif match := re.fullmatch(r"(\d+)x(\d+)", _text(file.attrs.get("geometry", ""))):
+        elif match := re.fullmatch(r"(\d{1,9})x(\d{1,9})", _text(file.attrs.get("geometry", ""))):
             size = int(match[2]), int(match[1])
     if size is None and frames is not None:
-        size = frames.read(0).shape
+        size = size_of(frames)
     grey = layout == "Metavision"  # Prophesee's sensors are monochrome
     return Source(f"HDF5 ({layout})", lambda: _events(path, layout), size, count, frames, grey)
 
@@ -186,6 +186,11 @@ def _frames(path: Path, file: Any, layout: str) -> Frames | None:
     if not names:
         return None
     times = np.array([images[name].attrs["timestamp"] for name in names])
+    if times.size != len(names):
+        raise RecordingError(
+            f"{path}: pictures have timestamps of shape {times.shape[1:]}, not one"
+        )
+    times = times.reshape(-1)
     return Frames(
         frame_times(path, times),
         lambda i: _frame(path, f"images/{names[i]}", ...),

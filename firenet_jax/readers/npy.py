@@ -25,7 +25,7 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Frames, Rows
-from firenet_jax.readers import Source, frame_times, in_chunks, reading, text, to_frame
+from firenet_jax.readers import Source, frame_times, in_chunks, reading, size_of, text, to_frame
 
 # layout: files of times, coordinates, polarities, frame times
 FILES = {
@@ -64,7 +64,7 @@ def read(path: Path, columns: str | None = None) -> Source:
     frames = _frames(path, layout)
     size = _size(path)
     if size is None and frames is not None:
-        size = frames.read(0).shape
+        size = size_of(frames)
     opened = partial(_columns, path, layout)
     return Source(f"{layout} folder", lambda: _rows(path, opened), size, len(t), frames)
 
@@ -75,13 +75,17 @@ def _layout(path: Path) -> str | None:
 
 def _mapped(path: Path) -> np.ndarray:
     with reading(path, Exception):  # a damaged header raises every kind
-        return np.load(path, mmap_mode="r", allow_pickle=False)
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        if not isinstance(array, np.ndarray):
+            array.close()
+            raise ValueError("an .npz of another name")
+        return array
 
 
 def _columns(path: Path, layout: str) -> list[np.ndarray]:
     """-> t, x, y, p"""
     t, xy, p = (_mapped(path / name) for name in FILES[layout][:3])
-    t, p = (column[:, 0] if column.ndim == 2 else column for column in (t, p))
+    t, p = (column[:, 0] if column.shape[1:] == (1,) else column for column in (t, p))
     if not (t.shape == p.shape == xy.shape[:1] and xy.shape[1:] == (2,)):
         raise RecordingError(
             f"{path}: its columns do not fit together: t {t.shape}, xy {xy.shape}, p {p.shape}, "

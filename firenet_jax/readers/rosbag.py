@@ -21,6 +21,7 @@ import contextlib
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from itertools import chain, takewhile
 from os.path import commonprefix
 from pathlib import Path
@@ -48,6 +49,7 @@ ARRAYS = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 PACKETS = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
 IMAGE = "sensor_msgs/msg/Image"
 WORDS = 1 << 18  # words of 16 bits decoded at once: messages are tiny
+WORD = {"evt3": 2, "libcaer_cmp": 2, "mono": 8}  # bytes of a word of an encoding
 PAUSE = 5_000_000  # microseconds between two messages: EVT3's clock may have wrapped around
 # Readers of files whose index is missing or damaged.
 TORN = {".bag": torn_bag.Torn, ".mcap": torn_mcap.Torn}
@@ -107,10 +109,17 @@ def _opened(path: Path, stack: contextlib.ExitStack):
             if files := _files(path):
                 bag = _Files([_opened(file, stack) for file in files])
         elif path.suffix.lower() in TORN:
-            bag = TORN[path.suffix.lower()](path)
+            found = path.stat()
+            bag = _torn(path, found.st_size, found.st_mtime_ns)
         if bag is None or not bag.connections:
             raise
         return bag
+
+
+@lru_cache(maxsize=4)
+def _torn(path: Path, size: int, changed: int) -> torn_bag.Torn:
+    """Kept, as a first look goes through the whole file, and each frame opens it."""
+    return TORN[path.suffix.lower()](path)
 
 
 def _files(path: Path) -> list[Path]:
@@ -264,10 +273,16 @@ class _Packet(NamedTuple):
 
 
 def _packet(message: _Message) -> _Packet:
+    """Raises ValueError for one that its decoder would not take, for many are decoded at once."""
     stamp = message.header()
     _, _, _, time_base = (message.number(size) for size in (4, 4, 8, 8))
     encoding, is_big = message.text(), message.number(1)
-    return _Packet(stamp, time_base, encoding, ">" if is_big else "<", message.bytes())
+    payload = message.bytes()
+    if len(payload) % WORD.get(encoding, 1):
+        raise ValueError(f"a message of {len(payload)} bytes, which are no whole words")
+    if encoding == "libcaer_cmp":
+        _to_microseconds(time_base)
+    return _Packet(stamp, time_base, encoding, ">" if is_big else "<", payload)
 
 
 def _packet_columns(path: Path, messages: Iterator[_Message]) -> Iterator[tuple[np.ndarray, ...]]:

@@ -34,6 +34,7 @@ from firenet_jax.readers import Source, reading, to_events
 from firenet_jax.settings import LONGEST_SIDE
 
 BLOCK = 1 << 21  # bytes parsed at once: about 90,000 events
+PIECE = 1 << 16  # bytes asked for at once: what a zip has unpacked of them is lost at damage
 HEAD = 1 << 16  # bytes from which the layout is inferred
 SNIFFED = 1000  # rows from which units and the order of columns are inferred
 BROKEN = zipfile.BadZipFile, zlib.error, EOFError, OSError  # what damaged compressed bytes raise
@@ -51,6 +52,7 @@ UNITS = {  # microseconds in a unit: its names
     1e-3: ("ns", "nsec", "nanosecond", "nanoseconds"),
 }
 LOGICAL = ("False", "FALSE", "false", "True", "TRUE", "true")  # and 0 and 1: pyarrow's
+SIDE = re.compile(r"\d{1,9}", re.ASCII)
 WORDS = "no one two three four five six seven eight nine ten".split()
 EXPECTED = {
     "t": ("the time", "a number of seconds"),
@@ -138,7 +140,7 @@ def _sniff(path: Path, member: str | None, columns: str | None = None) -> Layout
         names, unit = named
     for number, line in enumerate(map(str.strip, lines), 1):
         words = _words(line, "," if "," in line else " ")
-        if match := re.fullmatch(r"%geometry:(\d+),(\d+)", line):
+        if match := re.fullmatch(r"%geometry:(\d{1,9}),(\d{1,9})", line):
             size = int(match[2]), int(match[1])
             names, told = (names if columns else ("x", "y", "p", "t")), True
         elif named := _names(line.lower().lstrip("#% ")):
@@ -146,7 +148,7 @@ def _sniff(path: Path, member: str | None, columns: str | None = None) -> Layout
             told = True
         elif not line or line.startswith(("#", "%")):
             continue
-        elif size is None and len(words) == 2 and all(map(str.isdecimal, words)):
+        elif size is None and len(words) == 2 and all(map(SIDE.fullmatch, words)):
             size = (int(words[1]), int(words[0]))
         elif not (_is_number(words[0]) or names[0] == "p" and words[0] in LOGICAL):
             raise RecordingError(
@@ -269,7 +271,7 @@ def _pieces(stream: Any, size: int) -> Iterator[bytes]:
         pieces, missing = [], size
         while missing and found:
             try:
-                found = stream.read1(missing)
+                found = stream.read1(min(missing, PIECE))
             except BROKEN as damage:  # kept: asked again, a zip would say that it has ended
                 error, found = damage, b""
             pieces.append(found)

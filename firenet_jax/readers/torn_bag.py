@@ -8,6 +8,7 @@ each. The field `op` says what a record holds:
     2  a message: its connection, its time of recording      4, 6  indexes, which are not read
 """
 
+import bisect
 import bz2
 import io
 import struct
@@ -22,6 +23,8 @@ from firenet_jax.readers.aedat4 import up_to
 MAGIC = b"#ROSBAG V2.0\n"
 CHUNK, CONNECTION, MESSAGE = 5, 7, 2
 LARGEST = 1 << 28  # bytes of a record, as it is in the file and unpacked
+STRIDE = 1 << 20  # bytes between two places from which reading can begin
+BROKEN = ValueError, KeyError, struct.error, OSError, EOFError  # what damaged bytes raise here
 
 
 class Connection(NamedTuple):
@@ -38,8 +41,13 @@ class Torn:
         self.path = path
         self.known: dict[int, Connection] = {}
         self.ended: Exception | None = None
-        for _ in self._messages():  # fills `known`: connections stand among the messages
-            pass
+        self.place = len(self.magic)  # of the record that is being read
+        # All messages before such a place were recorded until its time.
+        self.places, latest = [(self.place, -1)], 0
+        for _, time, _ in self._messages():  # fills `known`: connections stand among the messages
+            if self.place - self.places[-1][0] >= STRIDE:
+                self.places.append((self.place, latest))
+            latest = max(latest, time)
 
     @property
     def connections(self) -> list[Connection]:
@@ -48,29 +56,53 @@ class Torn:
     def messages(self, connections, start: int | None = None) -> Iterator[tuple]:
         """(connection, time of recording in ns, bytes), not before `start`. Raises ValueError at
         the end, always: a file without an index was not closed."""
-        for connection, time, data in self._messages():
+        passed = bisect.bisect_left(self.places, start or 0, key=lambda place: place[1])
+        for connection, time, data in self._messages(self.places[max(passed - 1, 0)][0]):
             if connection in connections and time >= (start or 0):
                 yield connection, time, data
         raise ValueError("it has no index, so it ends early") from self.ended
 
-    def _messages(self) -> Iterator[tuple]:
+    def _messages(self, place: int | None = None) -> Iterator[tuple]:
+        """All from this place on; None: from the beginning."""
         with open(self.path, "rb") as file:
             try:
                 if file.read(len(self.magic)) != self.magic:
                     raise ValueError(f"it is no {self.format}")
+                file.seek(place or len(self.magic))
                 yield from self._inside(file)
-            except (ValueError, KeyError, struct.error, OSError, EOFError) as error:
-                self.ended = error
+            except BROKEN as error:
+                self.ended = error.with_traceback(None)  # which holds what was read
+
+    def _sorted(self, chunk: bytes) -> Iterator[tuple]:
+        """The messages of a chunk by their times, as an index would have them, up to damage."""
+        messages, damage = [], None
+        try:
+            for message in self._inside(io.BytesIO(chunk)):
+                messages.append(message)
+        except BROKEN as error:
+            damage = error
+        yield from sorted(messages, key=lambda message: message[1])
+        if damage is not None:
+            raise damage
+
+    def _size(self, file: BinaryIO, count: int) -> bytes:
+        """The first bytes of the next record, of which the place is kept."""
+        if not isinstance(file, io.BytesIO):
+            self.place = file.tell()
+        return file.read(count)
 
     def _inside(self, file: BinaryIO) -> Iterator[tuple]:
-        while size := file.read(4):
-            header = _fields(_bytes(file, size))
-            data = _bytes(file, file.read(4))
+        outermost = not isinstance(file, io.BytesIO)
+        while size := self._size(file, 4):
+            header = _fields(_whole(*_bytes(file, size)))
+            data, missing = _bytes(file, file.read(4))
             kind = header["op"][0]
-            if kind == CHUNK:
-                inside = self._inside(io.BytesIO(_unpacked(data, header["compression"])))
-                yield from sorted(inside, key=lambda message: message[1])  # as an index would
-            elif kind == CONNECTION:
+            if kind == CHUNK and outermost:  # of what is cut off the beginning is there
+                yield from self._sorted(_unpacked(data, header["compression"]))
+            elif kind == CHUNK:
+                raise ValueError("a chunk within a chunk")
+            _whole(data, missing)
+            if kind == CONNECTION:
                 package, _, name = _fields(data)["type"].decode().rpartition("/")
                 number = struct.unpack("<I", header["conn"])[0]
                 self.known[number] = Connection(header["topic"].decode(), f"{package}/msg/{name}")
@@ -80,10 +112,15 @@ class Torn:
                 yield self.known[number], seconds * 10**9 + nanoseconds, data
 
 
-def _bytes(file: BinaryIO, size: bytes) -> bytes:
+def _bytes(file: BinaryIO, size: bytes) -> tuple[bytes, int]:
+    """(so many bytes, how many of them are not there)"""
     count = struct.unpack("<I", size)[0]
     data = file.read(count) if count <= LARGEST else b""
-    if len(data) != count:
+    return data, count - len(data)
+
+
+def _whole(data: bytes, missing: int) -> bytes:
+    if missing:
         raise EOFError("ends within a record")
     return data
 

@@ -39,7 +39,7 @@ class Torn(torn_bag.Torn):
         super().__init__(path)
 
     def _inside(self, file: BinaryIO) -> Iterator[tuple]:
-        while head := file.read(9):
+        while head := self._size(file, 9):
             kind, size = struct.unpack("<BQ", head)
             if kind not in (SCHEMA, CHANNEL, MESSAGE, CHUNK):
                 if size >= FARTHEST:
@@ -62,18 +62,6 @@ class Torn(torn_bag.Torn):
                 yield self.known[number], time, data[22:]
             if not whole:
                 raise EOFError("ends within a chunk")
-
-    def _sorted(self, chunk: bytes) -> Iterator[tuple]:
-        """The messages of a chunk by their times, as an index would have them, up to damage."""
-        messages, damage = [], None
-        try:
-            for message in self._inside(io.BytesIO(chunk)):
-                messages.append(message)
-        except (ValueError, KeyError, struct.error, EOFError) as error:
-            damage = error
-        yield from sorted(messages, key=lambda message: message[1])
-        if damage is not None:
-            raise damage
 
 
 def _text(data: bytes, at: int) -> tuple[str, int]:
