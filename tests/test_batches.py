@@ -407,6 +407,26 @@ def test_a_compression_that_h5py_lacks_is_said(noise, monkeypatch):
     assert 'hdf5plugin: in the source folder, pip install ".[formats]"' in refused(noise[0])
 
 
+def read_small(path, data):
+    assert data.size < 1e6
+    return data[()]
+
+
+def test_pictures_that_claim_to_be_huge_are_not_read(tmp_path, monkeypatch):
+    """A few bytes of a compressed file can stand for gigabytes."""
+    for name, shape in (("images/image", (30_000, 30_000)), ("flow/flow", (2, 30_000, 30_000))):
+        path = write(tmp_path / "a.h5", random_events(0), noise_pictures(0))
+        with h5py.File(path, "r+") as file:
+            attributes = dict(file[f"{name}000000007"].attrs)
+            del file[f"{name}000000007"]
+            chunks = (1, 1000, 1000)[-len(shape) :]
+            made = file.create_dataset(f"{name}000000007", shape, "u1", chunks=chunks)
+            made.attrs.update(attributes)
+        monkeypatch.setattr("firenet_jax.training.batches._whole", read_small)
+        message = refused(path, windows=IMAGES - 1, augment=NO_AUGMENT)
+        assert "000000007: has the shape" in message and "30000" in message
+
+
 def test_pictures_and_flow_of_other_sizes_are_said(tmp_path):
     for name, expected in (("images/image", "(20, 24)"), ("flow/flow", "(2, 20, 24)")):
         path = write(tmp_path / "a.h5", random_events(0), noise_pictures(0))

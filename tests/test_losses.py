@@ -122,6 +122,16 @@ def test_detail_counts_up_to_three_tenths_of_a_pixel(moved, counts):
     assert bool(terms["detail"] > 0) is counts
 
 
+def test_detail_does_not_count_where_motion_is_not_known():
+    """As with recordings, which have no flow: there it counted in fast motion, too."""
+    images, truths, displacements, visible = sequence(2)
+    displacements[:], visible[:] = np.nan, False
+    displacements[0, 0], visible[0, 0] = 0.0, True
+    _, terms = sequence_loss(images, truths, displacements, visible, replace(NOTHING, detail=1.0))
+    expected = references.detail(images[0, 0], truths[0, 0]) / images[:, :, 0, 0].size
+    np.testing.assert_allclose(terms["detail"], expected, rtol=1e-3)
+
+
 def test_the_first_flow_is_not_used():
     images, truths, displacements, visible = sequence()
     expected, _ = sequence_loss(images, truths, displacements, visible, replace(SHORT, l0=0))

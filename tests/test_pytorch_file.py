@@ -356,6 +356,18 @@ def test_one_list_of_pairs_from_which_dicts_are_made_without_end(file, layout, m
         read_state_dict(file(layout(whole(pairs, made), SMALL)))
 
 
+def test_one_long_tuple_that_is_given_without_end(file, layout, monkeypatch):
+    """To a function, or as the name of a storage: each time it was copied."""
+    monkeypatch.setattr(pytorch_file, "MAX_INSTRUCTIONS", 3000)
+    given = b"(" + 200 * b"N" + b"tq\x01"
+    storage = text("storage") + b"ctorch\nFloatStorage\n" + text("0") + text("cpu") + number(1)
+    named = b"(" + storage + 200 * b"N" + b"tq\x01"
+    calls = b"cnumpy\ndtype\nq\x02](" + 20 * b"h\x02h\x01R" + b"e"
+    for parts in ((given, b"0", calls), (named, b"0](", 20 * b"h\x01Q", b"e")):
+        with pytest.raises(CheckpointError, match="more than 3000 instructions and items"):
+            read_state_dict(file(layout(whole(*parts), SMALL)))
+
+
 def test_members_of_a_zip_that_overlap(file):
     """Each holds all that follow it: of n bytes n^2 would be read."""
     content = new_file(whole(mapping(a=tensor("0", 6, (6,), (1,)))), SMALL | {"1": bytes(4000)})

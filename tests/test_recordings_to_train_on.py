@@ -21,6 +21,7 @@ from firenet_jax.readers import open_recording
 from firenet_jax.simulation.sensor import Simulation
 from firenet_jax.storage.files import locked
 from firenet_jax.storage.sequence_file import Picture, write_sequence
+from firenet_jax.training.batches import Augment
 from firenet_jax.training.settings import Train
 from firenet_jax.training.step import initial_train_state, loss_of, near_events, train_step
 
@@ -97,6 +98,14 @@ def test_recordings_that_cannot_be_learnt_from_are_said(tmp_path, folder):
     (tmp_path / "notes" / "readme.md").touch()
     with pytest.raises(RecordingError, match="notes: holds no HDF5 sequences"):
         train.cut_off(tmp_path / "notes", 3)
+    (tmp_path / "set").mkdir()
+    write_sequence(tmp_path / "set" / "a.h5", [Events.of([5], [1], [1], [1])],
+                   [Picture(t, np.zeros((8, 8), np.uint8), None) for t in (0, 10_000)],
+                   height=8, width=8)  # fmt: skip
+    with pytest.raises(RecordingError, match="set: is a folder of HDF5 sequences, of which .* one"):
+        train.cut_off(tmp_path / "set", 3)
+    with pytest.raises(SettingsError, match="--near-events has no effect beside --voxel-noise"):
+        tiny(tmp_path, data=(folder,), near_events=True, augment=Augment(voxel_noise=0.1))
     assert train.cut_off(folder, 9).end == 10
     backwards = tmp_path / "backwards.h5"
     pictures = [Picture(t, np.zeros((8, 8), np.uint8), None) for t in (0, 20_000, 10_000)]

@@ -36,6 +36,7 @@ from firenet_jax.storage.files import identity, write_text
 from firenet_jax.storage.sequence_file import Picture, write_sequence
 from firenet_jax.tensors import tensor_chunks
 from firenet_jax.training import run as training
+from firenet_jax.training.batches import is_set
 from firenet_jax.training.settings import Train
 from firenet_jax.training.step import near_events
 from firenet_jax.windows import Windows, cut
@@ -92,6 +93,11 @@ def cut_off(path: Path, windows: int) -> Cut:
     Raises RecordingError where it has no frames, too few of them for both parts, or no events in
     their time.
     """
+    if is_set(path):
+        raise RecordingError(
+            f"{path}: is a folder of HDF5 sequences, of which --data takes one, alone: put all "
+            "sequences into one folder"
+        )
     if path.is_dir() and not is_recording(path):
         raise RecordingError(
             f"{path}: holds no HDF5 sequences, as `firenet simulate` makes them: name another "

@@ -254,7 +254,7 @@ def random_scene(
 
 
 def _pauses(uniform, duration, settings: SceneSettings) -> jax.Array:
-    """(3, PAUSES): starts, ends and ramps of a scene's pauses, seconds."""
+    """(PAUSES, 3): starts, ends and ramps of a scene's pauses, seconds."""
     # One pause at most in each half, so that two never overlap.
     ramp = 0.02 * duration
     start = duration * (uniform((0.02, 0.3), (PAUSES,)) + jnp.arange(PAUSES) / PAUSES)

@@ -457,9 +457,9 @@ def _extend(target, items: list) -> None:
 
 
 def _length(args) -> int:
-    """Of the lists and dicts that a function is given."""
-    args = args if isinstance(args, tuple) else ()
-    return sum(len(arg) for arg in args if isinstance(arg, list | tuple | dict))
+    """Items that a function is given, and those of the lists and dicts among them."""
+    args = args if isinstance(args, list | tuple) else ()
+    return len(args) + sum(len(arg) for arg in args if isinstance(arg, list | tuple | dict))
 
 
 def _call(function, args):
@@ -560,7 +560,9 @@ def _unpickle(stream: io.BytesIO, storages: dict[str, _Storage]):
                 copied += _length(args)
                 stack.append(_call(function, args))
             case "BINPERSID":
-                stack.append(_storage(storages, *last(1)))
+                (pid,) = last(1)
+                copied += _length(pid)
+                stack.append(_storage(storages, pid))
             case "PROTO" | "FRAME":
                 pass
             case "STOP":

@@ -228,15 +228,16 @@ def _example(
         events = _cropped(_read_events(file, facts, rows), top, left, crop, down, across)
         for end in np.unique(ends):
             name = index.names[end]
-            image = to_frame(_whole(facts.path, file["images"][name]), facts.path)
-            _check_shape(facts.path, name, image, shape)
+            picture = file["images"][name]
+            _check_shape(facts.path, name, picture.shape[:2], shape)  # before it is read
+            image = to_frame(_whole(facts.path, picture), facts.path)
             images[end] = image[cut][turn]
         for end in ends[~paused]:
             name = index.names[end].replace("image", "flow")
             moved = np.full((2, crop, crop), np.nan, np.float32)
             if name in file.get("flow", ()):
+                _check_shape(facts.path, name, file["flow"][name].shape, (2, *shape))
                 velocity = _whole(facts.path, file["flow"][name])  # pixels per second
-                _check_shape(facts.path, name, velocity, (2, *shape))
                 seconds = np.float32(1e-6 * (index.times[end] - index.times[end - 1]))
                 moved = seconds * velocity[cut][turn].astype(np.float32)
             displacements[end] = sign * np.moveaxis(moved, 0, -1)
@@ -287,10 +288,10 @@ def _whole(path: Path, data: Any) -> np.ndarray:
     return data[()]
 
 
-def _check_shape(path: Path, name: str, found: np.ndarray, expected: tuple[int, ...]) -> None:
-    if found.shape != expected:
+def _check_shape(path: Path, name: str, found: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    if found != expected:
         raise RecordingError(
-            f"{path}, {name}: has the shape {found.shape}, expected {expected}: the file is "
+            f"{path}, {name}: has the shape {found}, expected {expected}: the file is "
             "damaged or of another format"
         )
 

@@ -125,7 +125,8 @@ def sequence_loss(
     per_image, terms = reconstruction_loss(images, truths, settings)
     if settings.detail:
         moved = jnp.where(visible, jnp.abs(displacements).max(-1), 0.0).max((-2, -1))
-        terms["detail"] = jnp.where(moved < MAX_STILL_MOTION, metrics.detail(images, truths), 0.0)
+        still = (moved < MAX_STILL_MOTION) & visible.any((-2, -1))  # else its motion is not known
+        terms["detail"] = jnp.where(still, metrics.detail(images, truths), 0.0)
         per_image += settings.detail * terms["detail"]
     terms = {"reconstruction": per_image, **terms}
     loss = per_image.sum(0).mean()

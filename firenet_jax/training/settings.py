@@ -69,7 +69,7 @@ class Train:
     """Windows per step: more than --l0 and at most --L + 1 (11 to 21 with the defaults)."""
     chain: int = 1
     """Truncated back-propagation through time: carry the state through up to this many steps.
-    Sequences of a batch differ in length, in a geometric series (64, batch 4: 3, 8, 23, 64)."""
+    Simulated sequences of a batch differ in length (64, batch 4: 3, 8, 23, 64)."""
     renderings: int = 5
     """Greatest number of renderings per window; on a CPU there are fewer where less moves."""
     motion: tuple[float, float] = (1.25, 2.5)
@@ -151,6 +151,11 @@ class Train:
                 f"windows is {self.windows}, but as many lead to and fro: choose an even number"
             )
         check_seed(self.seed)
+        if self.near_events and self.data and self.augment.voxel_noise:
+            raise SettingsError(
+                "--near-events has no effect beside --voxel-noise, which looks like events "
+                "everywhere: leave one out"
+            )
         if not self.save_every >= 0:
             raise SettingsError(f"save_every is {self.save_every} seconds, but must be 0 or more")
         check_share("procedural", self.procedural, "textures")
