@@ -10,7 +10,7 @@ trained, and each step also has
                 inverted), up to forty times: each image is to be that of the first round, which
                 begins when the state has seen both directions
 
-    loss = L + 20 HOLD (|I - I_0| + 3 |mean(I - I_0)|) for each of the two, 20 windows in a step
+    loss = L + 20 hold (|I - I_0| + 3 |mean(I - I_0)|) for each of the two, 20 windows in a step
 
 I_0 is what the network itself made, then: it may become another, but is to stay that. For
 palindromes a stage may have, in place of that, which is smaller where there is less contrast,
@@ -50,8 +50,6 @@ from firenet_jax.training.step import (
 
 NOISES = np.array([0, 0.02, 0.35, 0.1], np.float32)  # events per pixel, of each place at rest
 LONGEST, SHORTER = 30, 0.5  # steps of a rest; the share of those that end earlier
-CUT = 64  # pixels on a side of both
-HOLD = 2.0
 RAMP, DECAY = 40, 0.995  # steps until the rate is reached; of the average
 
 
@@ -60,7 +58,9 @@ class Holding(NamedTuple):
 
     turning: int = 2  # places that go to and fro
     turns: tuple[int, int] = (6, 40)  # so many times
-    alike: float = 0.0  # how much correlation weighs, in place of HOLD
+    hold: float = 2.0  # how much staying weighs
+    alike: float = 0.0  # how much correlation weighs, in place of that
+    cut: int = 64  # pixels on a side of what rests and of what goes to and fro
     faint: float = metrics.FAINT  # what is so much brighter is so for sure, in the equalised losses
 
 
@@ -75,13 +75,13 @@ class Held(NamedTuple):
     passes: jax.Array  # (M,) int32, how often they have been passed
 
 
-def nothing_held(windows: int, turning: int = Holding().turning) -> Held:
-    size = CUT, CUT
-    moving = jnp.zeros((windows, turning, *size))
+def nothing_held(windows: int, how: Holding = Holding()) -> Held:
+    size = how.cut, how.cut
+    moving = jnp.zeros((windows, how.turning, *size))
     return Held(
         initial_state(len(NOISES), *size), jnp.zeros((len(NOISES), *size)),
-        initial_state(turning, *size), jnp.zeros((*moving.shape, 5)),
-        (moving, moving), jnp.zeros(turning, jnp.int32),
+        initial_state(how.turning, *size), jnp.zeros((*moving.shape, 5)),
+        (moving, moving), jnp.zeros(how.turning, jnp.int32),
     )  # fmt: skip
 
 
@@ -135,7 +135,7 @@ def hold_step(
     (key, textures), number = source, state.step
     data, (seen, before), warm = steps_of._simulated(key, textures, settings, state)
     noise_key, cut_key = jax.random.split(jax.random.fold_in(key, number + 10**6))
-    size = settings.windows, len(NOISES), CUT, CUT, 5
+    size = settings.windows, len(NOISES), how.cut, how.cut, 5
     noise, (tensors, first) = balanced(noise_key, size, NOISES), next_pass(held)
 
     def loss(params):
@@ -146,7 +146,7 @@ def hold_step(
         counts = (held.passes >= 4) * 1.0
         palindrome = (unlike if how.alike else moved)(passed, first, counts)
         terms |= {"loss": value, "rest": rest, "palindrome": palindrome}
-        value += settings.windows * (HOLD * rest + (how.alike or HOLD) * palindrome)
+        value += settings.windows * (how.hold * rest + (how.alike or how.hold) * palindrome)
         return value, (terms, last, images, rested, turned, passed)
 
     gradient, (terms, last, images, rested, turned, passed) = jax.grad(loss, has_aux=True)(
@@ -163,11 +163,11 @@ def hold_step(
     state = TrainState(params, optimised, state.step + 1, (seen, last))
 
     # What has ended begins anew with a part of what this step saw.
-    corner = jax.random.randint(cut_key, (2,), 0, settings.crop - CUT + 1)
+    corner = jax.random.randint(cut_key, (2,), 0, settings.crop - how.cut + 1)
 
     def renewed(old, new, ending, axis=0, start=1):
         for i in range(2):
-            new = jax.lax.dynamic_slice_in_dim(new, corner[i], CUT, start + i)
+            new = jax.lax.dynamic_slice_in_dim(new, corner[i], how.cut, start + i)
         new = jnp.take(new, (jnp.arange(len(ending)) + number) % settings.batch, axis)
         chosen = jnp.expand_dims(ending, [n for n in range(new.ndim) if n != axis])
         return jnp.where(chosen, new, old)
@@ -198,7 +198,7 @@ def train_and_hold(
     )
     source = jax.random.key(settings.seed + 1), jnp.asarray(textures)
     state = initial_train_state(jax.tree.map(jnp.array, weights.params), step_settings)
-    held = nothing_held(settings.windows, how.turning)
+    held = nothing_held(settings.windows, how)
     average = jax.tree.map(jnp.array, weights.params)
     rng = np.random.default_rng(settings.seed)
     left = np.ones(len(NOISES), int), np.ones(how.turning, int)  # steps of each

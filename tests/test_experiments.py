@@ -136,6 +136,22 @@ def test_tables_of_the_model_card_hold_what_was_measured(monkeypatch):
     assert card.filled(text, *results) != text
 
 
+def test_the_model_card_is_told_where_others_are_ahead(monkeypatch):
+    monkeypatch.syspath_prepend(EXPERIMENTS)
+    card = importlib.import_module("model_card")
+    rows = [
+        {"kind": kind, "weights": name, "ssim": ssim, "mse": mse}
+        for kind, name, ssim, mse in (
+            ("a", "published", 0.5, 0.04), ("a", "cista", 0.8, 0.05), ("a", "ours", 0.6, 0.03),
+            ("b", "published", 0.5, 0.02), ("b", "another", 0.9, 0.01), ("b", "ours", 0.5, 0.03),
+        )
+    ]  # fmt: skip
+    assert list(card.behind("some", rows, ("kind",))) == [
+        "some, a: ssim 0.6000, cista 0.8000 (-25.0 %)",
+        "some, b: mse 0.0300, published 0.0200 (+50.0 %)",
+    ]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SMALL)
 def test_runs(name, tmp_path):

@@ -38,14 +38,14 @@ def test_a_stage_at_rest_trains_what_has_a_memory_and_nothing_else(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_stage_that_holds_trains_all_parts(tmp_path, monkeypatch):
-    monkeypatch.setattr(holding, "CUT", 16)
+def test_a_stage_that_holds_trains_all_parts(tmp_path):
+    how = holding.Holding(cut=16)
     settings = Train(
         tmp_path, textures=4, batch=2, crop=20, windows=2, chain=2, warmup=0,
         loss=Loss(nlpd=0, haarpsi=0, lambda_tc=0, l0=1),
         scene=SceneSettings(objects=0), optimiser="centred",
     )  # fmt: skip
-    made = holding.train_and_hold(WEIGHTS, settings, tmp_path / "made.npz", steps=3)
+    made = holding.train_and_hold(WEIGHTS, settings, tmp_path / "made.npz", steps=3, how=how)
     before, after = fj.load_weights(WEIGHTS).params, fj.load_weights(made).params
     for name in before:
         pairs = zip(*map(jax.tree.leaves, (before[name], after[name])), strict=True)
