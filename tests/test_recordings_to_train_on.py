@@ -104,6 +104,11 @@ def test_recordings_that_cannot_be_learnt_from_are_said(tmp_path, folder):
                    height=8, width=8)  # fmt: skip
     with pytest.raises(RecordingError, match="set: is a folder of HDF5 sequences, of which .* one"):
         train.cut_off(tmp_path / "set", 3)
+    write_folder(tmp_path / "both", 20)  # with what somebody made of it
+    write_sequence(tmp_path / "both" / "a.h5", [Events.of([5], [1], [1], [1])],
+                   [Picture(t, np.zeros((8, 8), np.uint8), None) for t in (0, 10_000)],
+                   height=8, width=8)  # fmt: skip
+    assert train.cut_off(tmp_path / "both", 3).end > 0
     with pytest.raises(SettingsError, match="--near-events has no effect beside --voxel-noise"):
         tiny(tmp_path, data=(folder,), near_events=True, augment=Augment(voxel_noise=0.1))
     assert train.cut_off(folder, 9).end == 10

@@ -96,11 +96,14 @@ def test_a_time_that_is_there_twice_is_said(tmp_path, recording, caplog):
     assert "its times are not in order" in caplog.text
 
 
-def test_a_unit_that_is_not_that_of_the_file(tmp_path, recording):
+def test_a_unit_that_is_not_that_of_the_file(tmp_path, recording, caplog):
+    """It is taken, for a header may have been misunderstood, but said."""
     assert read(tmp_path, recording, "5.25s\n", unit="s", since="zero").tolist() == [5_250_000]
-    for text in ("5.25s\n", "# timestamp [s]\n5.25\n"):
-        with pytest.raises(RecordingError, match="says that its times are in s: leave out --unit"):
-            read(tmp_path, recording, text, unit="ms", since="zero")
+    assert not caplog.text
+    for text in ("5250s\n", "# timestamp [s]\n5250\n", "# one every 10 s\n5250\n"):
+        caplog.clear()
+        assert read(tmp_path, recording, text, unit="ms", since="zero").tolist() == [5_250_000]
+        assert "says that its times are in seconds, --unit takes them as mill" in caplog.text
 
 
 def test_times_of_today_keep_their_microseconds(tmp_path):

@@ -143,7 +143,10 @@ def _triggers(wanted: Times, recording: Recording) -> np.ndarray:
 def _from_file(path: Path, wanted: Times, recording: Recording) -> np.ndarray:
     numbers, unit, since_start = read_times(path)
     if wanted.unit and unit and unit != wanted.unit:
-        raise RecordingError(f"{path}: says that its times are in {unit}: leave out --unit")
+        logger.warning(
+            "%s: says that its times are in %s, --unit takes them as %s",
+            path, UNIT_NAMES[unit], UNIT_NAMES[wanted.unit],
+        )  # fmt: skip
     unit = wanted.unit or unit
     since_start = since_start if wanted.since is None else wanted.since == "start"
     units = [unit] if unit else [*UNITS] if whole_numbers(numbers) else ["s", "ms"]

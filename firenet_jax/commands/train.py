@@ -93,7 +93,7 @@ def cut_off(path: Path, windows: int) -> Cut:
     Raises RecordingError where it has no frames, too few of them for both parts, or no events in
     their time.
     """
-    if is_set(path):
+    if is_set(path) and not is_recording(path):
         raise RecordingError(
             f"{path}: is a folder of HDF5 sequences, of which --data takes one, alone: put all "
             "sequences into one folder"

@@ -44,6 +44,7 @@ FORMATS = (
     "raw", "es",
 )  # fmt: skip
 
+SPIKE = 4  # times in a row that may be damaged without being taken for a turn of the clock
 CHUNK = 1 << 18  # events a reader yields at once: 3 MB as Events
 
 
@@ -244,7 +245,8 @@ def frame_times(path: Path, times: np.ndarray) -> np.ndarray:
 
     Raises RecordingError for a time that is not finite, or that no clock tells."""
     latest = MAX_TIME / 1e6 if times.dtype.kind == "f" else MAX_TIME
-    right = (-latest < times) & (times < latest)  # not NaN
+    wide = times.astype(np.float64) if times.dtype.kind == "f" else times
+    right = (-latest < wide) & (wide < latest)  # not NaN
     if not right.all():
         frame = int(np.argmin(right))
         raise RecordingError(f"{path}, frame {frame + 1}: its time is {times[frame]}")
@@ -332,26 +334,32 @@ def to_frame(picture: np.ndarray, path: Path) -> np.ndarray:
 def unwrap(counter: np.ndarray, bits: int, last: int) -> np.ndarray:
     """(N,) values of a counter of so many bits, which wraps around -> int64 that keeps growing.
 
-    last: its unwrapped value just before. Falls of more than half its range are wraps, but where
-    they lead back to what preceded a rise as large, after a damaged value; smaller ones are left as
-    they are, for `events.checked` to judge.
+    last: its unwrapped value just before. Falls of more than half its range are wraps, but for
+    damage: where a few values rise or fall by as much and the next one goes on from before them.
+    (That is not seen at the first and last of what is given.) Smaller falls are left as they are,
+    for `events.checked` to judge.
     """
     counter = np.asarray(counter, np.int64)
     whole = 1 << bits
     before = np.append(last & (whole - 1), counter[:-1])
     steps = counter - before
     wraps = steps < -(whole // 2)
+    late = steps > whole - (whole >> 8)  # from before the last wrap, if there was one
+    places = np.flatnonzero(np.abs(steps) > whole // 2)
+    places = places[places > 0]  # the first value may be any
+    if len(places) > 1:
+        away, again = places[:-1], places[1:]
+        since = counter[again] - before[away]
+        spike = (since >= 0) & (since < whole >> 8) & (again - away <= SPIKE)
+        spike &= (steps[away] > 0) != (steps[again] > 0)
+        high = spike & (steps[away] > 0)
+        low = spike & (steps[away] < 0) & ~late[again]
+        low[1:] &= ~high[:-1]  # what ends a spike begins no other
+        wraps[away[low]] = wraps[again[high]] = False
+        back = late & ((last >> bits) + np.cumsum(wraps) > 0)
+        wraps[again[high]] = back[away[high]]  # what was taken back goes on
     turns = (last >> bits) + np.cumsum(wraps)
-    back = (steps > whole - (whole >> 8)) & (turns > 0)  # late, from before the last wrap
-    if wraps.any():
-        rises = np.flatnonzero((steps > whole // 2) & ~back)
-        rises = rises[rises > 0]  # the first value may be any
-        falls = np.flatnonzero(wraps)
-        latest = np.searchsorted(rises, falls) - 1  # the last rise before each fall
-        since = counter[falls] - before[rises[latest]] if rises.size else np.full(falls.shape, -1)
-        wraps[falls[(latest >= 0) & (since >= 0) & (since < whole >> 8)]] = False
-        turns = (last >> bits) + np.cumsum(wraps)
-    return counter + ((turns - np.cumsum(back)) << bits)
+    return counter + ((turns - np.cumsum(late & (turns > 0))) << bits)
 
 
 def extra(module: str, path: Path) -> ModuleType:

@@ -63,11 +63,14 @@ def decode(state: State, words: np.ndarray) -> tuple[State, tuple[np.ndarray, ..
 
 def without_jitter(latest: int, t: np.ndarray) -> tuple[int, np.ndarray]:
     """The latest time before them, (N,) int64 -> the latest one, the times without small falls. A
-    larger fall begins anew: what preceded it may have been damaged."""
+    larger fall from which they do not come back begins anew: what preceded it was damaged."""
     highest = np.append(latest, t)
     falls = np.flatnonzero(np.diff(highest) < -JITTER) + 1
+    to_come = np.maximum.accumulate(highest[::-1])[::-1]
     for start, stop in itertools.pairwise([0, *falls.tolist(), len(highest)]):
         part = highest[start:stop]
+        if start and to_come[start] >= highest[start - 1] - JITTER:
+            part[0] = max(part[0], highest[start - 1])
         np.maximum.accumulate(part, out=part)
     return int(highest[-1]), np.where(highest[1:] - t <= JITTER, highest[1:], t)
 

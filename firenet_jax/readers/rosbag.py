@@ -296,11 +296,20 @@ def _packet_columns(path: Path, messages: Iterator[_Message]) -> Iterator[tuple[
             f"{' or '.join(DECODERS)}: convert the bag to one of them"
         )
     shift = None
-    for stamp, (t, x, y, p) in DECODERS[first.encoding](chain([first], packets)):
+    packets = chain([first], _alike(packets, first.encoding))
+    for stamp, (t, x, y, p) in DECODERS[first.encoding](packets):
         if len(t):
             if shift is None:
                 shift = stamp - int(t[0])
             yield t + shift, x, y, p
+
+
+def _alike(packets: Iterator[_Packet], encoding: str) -> Iterator[_Packet]:
+    for packet in packets:
+        if packet.encoding != encoding:
+            found = _in_a_line(packet.encoding)
+            raise ValueError(f"a message encoded as {found} among others of {encoding}")
+        yield packet
 
 
 def _mono(packets: Iterator[_Packet]) -> Iterator[tuple[int, tuple[np.ndarray, ...]]]:

@@ -18,13 +18,13 @@ from typing import BinaryIO, NamedTuple
 
 import pyarrow as pa
 
-from firenet_jax.readers.aedat4 import up_to
-
 MAGIC = b"#ROSBAG V2.0\n"
 CHUNK, CONNECTION, MESSAGE = 5, 7, 2
 LARGEST = 1 << 28  # bytes of a record, as it is in the file and unpacked
 STRIDE = 1 << 20  # bytes between two places from which reading can begin
-BROKEN = ValueError, KeyError, struct.error, OSError, EOFError  # what damaged bytes raise here
+PIECE = 1 << 16  # bytes unpacked at once: of a chunk that is cut off those that precede are there
+# What damaged bytes raise here.
+BROKEN = ValueError, LookupError, struct.error, OSError, EOFError
 
 
 class Connection(NamedTuple):
@@ -98,7 +98,10 @@ class Torn:
             data, missing = _bytes(file, file.read(4))
             kind = header["op"][0]
             if kind == CHUNK and outermost:  # of what is cut off the beginning is there
-                yield from self._sorted(_unpacked(data, header["compression"]))
+                unpacked, damage = _unpacked(data, header["compression"])
+                yield from self._sorted(unpacked)
+                if damage is not None:
+                    raise damage
             elif kind == CHUNK:
                 raise ValueError("a chunk within a chunk")
             _whole(data, missing)
@@ -135,12 +138,25 @@ def _fields(data: bytes) -> dict[str, bytes]:
     return found
 
 
-def _unpacked(data: bytes, how: bytes) -> bytes:
+def _unpacked(data: bytes, how: bytes) -> tuple[bytes, Exception | None]:
+    """-> what precedes damage, and that."""
     if how == b"none":
-        return data
+        return data, None
     if how == b"bz2":
-        return bz2.BZ2Decompressor().decompress(data, LARGEST)
+        return bz2.BZ2Decompressor().decompress(data, LARGEST), None
     if how == b"lz4":
-        with pa.CompressedInputStream(pa.BufferReader(data), "lz4") as stream:
-            return up_to(stream, LARGEST)
+        return unpacked_by("lz4", data, LARGEST)
     raise ValueError(f"a chunk compressed by {how!r}")
+
+
+def unpacked_by(codec: str, data: bytes, most: int) -> tuple[bytes, Exception | None]:
+    """As `_unpacked`, of lz4 or zstd, at most so many bytes."""
+    pieces, missing = [], most
+    try:
+        with pa.CompressedInputStream(pa.BufferReader(data), codec) as stream:
+            while missing and (piece := stream.read(min(missing, PIECE))):
+                pieces.append(piece)
+                missing -= len(piece)
+    except BROKEN as error:
+        return b"".join(pieces), error
+    return b"".join(pieces), None

@@ -18,10 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-import pyarrow as pa
-
 from firenet_jax.readers import torn_bag
-from firenet_jax.readers.aedat4 import up_to
 from firenet_jax.readers.torn_bag import LARGEST, Connection
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -49,7 +46,10 @@ class Torn(torn_bag.Torn):
             data = file.read(size) if size <= LARGEST else b""
             whole = len(data) == size
             if kind == CHUNK and not isinstance(file, io.BytesIO):
-                yield from self._sorted(_unpacked(data))
+                unpacked, damage = _unpacked(data)
+                yield from self._sorted(unpacked)
+                if damage is not None:
+                    raise damage
             elif not whole or kind == CHUNK:
                 raise EOFError("ends within a record, or has a chunk within a chunk")
             elif kind == SCHEMA:
@@ -70,14 +70,13 @@ def _text(data: bytes, at: int) -> tuple[str, int]:
     return data[at + 4 : at + 4 + size].decode(), at + 4 + size
 
 
-def _unpacked(data: bytes) -> bytes:
+def _unpacked(data: bytes) -> tuple[bytes, Exception | None]:
     _, _, size, _ = struct.unpack_from("<QQQI", data)
     how, at = _text(data, 28)
     packed = struct.unpack_from("<Q", data, at)[0]
     data = data[at + 8 : at + 8 + packed]
     if how in ("lz4", "zstd"):
-        with pa.CompressedInputStream(pa.BufferReader(data), how) as stream:
-            data = up_to(stream, min(size, LARGEST))
-    elif how:
+        return torn_bag.unpacked_by(how, data, min(size, LARGEST))
+    if how:
         raise ValueError(f"a chunk compressed by {how!r}")
-    return data
+    return data, None

@@ -13,6 +13,7 @@ Threads read ahead; events become tensors on the device.
 """
 
 import hashlib
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -161,6 +162,8 @@ def _index(path: Path) -> Index:
         images, stamps = file["images"], file["events/ts"]
         names = in_order(images)
         times = np.array([images[name].attrs["timestamp"] for name in names])
+        if times.size == len(names):  # MATLAB writes arrays of one
+            times = times.reshape(-1)
         if not (np.diff(times) > 0).all():  # in this form NaN fails too
             image = int(np.argmin(np.diff(times) > 0)) + 1
             raise RecordingError(
@@ -229,7 +232,8 @@ def _example(
         for end in np.unique(ends):
             name = index.names[end]
             picture = file["images"][name]
-            _check_shape(facts.path, name, picture.shape[:2], shape)  # before it is read
+            channels = picture.shape[2:] if picture.size > 4 * math.prod(shape) else ()
+            _check_shape(facts.path, name, (*picture.shape[:2], *channels), shape)  # not read yet
             image = to_frame(_whole(facts.path, picture), facts.path)
             images[end] = image[cut][turn]
         for end in ends[~paused]:
