@@ -1164,8 +1164,9 @@ LAST_MEAN = mixed((LOYALS, 7), ({"fleet": 2, "alert": 5, "constant": 6}, 13))
 # For the next mean, not in the one that is built in: from that, side by side, 72 minutes each, with
 # less of each step for what is held; and 32 minutes from four parts of it and three of each, in
 # which more is held. Half of what is built in, a fifth of "eager" and three tenths of "faithful" is
-# better with usual windows and dense ones of clean sensors and has more contrast; "ready" beside
-# "eager" rests less well. (In motion of less than 6 pixels alone memory is lost within 22 minutes.)
+# better with usual windows of faulty sensors and an event per pixel of clean ones, and has more
+# contrast; "ready" beside "eager" rests less well. (In motion of less than 6 pixels alone memory is
+# lost within 22 minutes.)
 EAGER = replace(
     ALERT,
     steps=1589,

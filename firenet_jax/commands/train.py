@@ -93,12 +93,12 @@ def cut_off(path: Path, windows: int) -> Cut:
     Raises RecordingError where it has no frames, too few of them for both parts, or no events in
     their time.
     """
-    if is_set(path) and not is_recording(path):
-        raise RecordingError(
-            f"{path}: is a folder of HDF5 sequences, of which --data takes one, alone: put all "
-            "sequences into one folder"
-        )
     if path.is_dir() and not is_recording(path):
+        if is_set(path):
+            raise RecordingError(
+                f"{path}: is a folder of HDF5 sequences, of which --data takes one, alone: put all "
+                "sequences into one folder"
+            )
         raise RecordingError(
             f"{path}: holds no HDF5 sequences, as `firenet simulate` makes them: name another "
             "folder, or recordings themselves"

@@ -195,20 +195,19 @@ def _unpacked(file: BinaryIO, layout: Layout, offset: int, size: int, most: int 
     data = file.read(size)
     if layout.codec:
         with pa.CompressedInputStream(pa.BufferReader(data), layout.codec) as stream:
-            data = up_to(stream, most + 1)
+            data = b"".join(up_to(stream, most + 1))
     if len(data) > most and most == PACKET:
         raise ValueError(f"more than {PACKET >> 20} MB unpacked")
     return data[4:]
 
 
-def up_to(stream, most: int) -> bytes:
-    """Reads at most so many bytes, piece by piece: pyarrow's streams allocate all that is asked for
-    at once."""
-    pieces, missing = [], most
-    while missing and (piece := stream.read(min(missing, PIECE))):
-        pieces.append(piece)
+def up_to(stream, most: int, size: int = PIECE) -> Iterator[bytes]:
+    """Reads at most so many bytes, in pieces of this size: pyarrow's streams allocate all that is
+    asked for at once."""
+    missing = most
+    while missing and (piece := stream.read(min(missing, size))):
+        yield piece
         missing -= len(piece)
-    return b"".join(pieces)
 
 
 def _events(path: Path, layout: Layout) -> Iterator[tuple[np.ndarray, ...]]:

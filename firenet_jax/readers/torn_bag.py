@@ -18,6 +18,8 @@ from typing import BinaryIO, NamedTuple
 
 import pyarrow as pa
 
+from firenet_jax.readers.aedat4 import up_to
+
 MAGIC = b"#ROSBAG V2.0\n"
 CHUNK, CONNECTION, MESSAGE = 5, 7, 2
 LARGEST = 1 << 28  # bytes of a record, as it is in the file and unpacked
@@ -151,12 +153,10 @@ def _unpacked(data: bytes, how: bytes) -> tuple[bytes, Exception | None]:
 
 def unpacked_by(codec: str, data: bytes, most: int) -> tuple[bytes, Exception | None]:
     """As `_unpacked`, of lz4 or zstd, at most so many bytes."""
-    pieces, missing = [], most
+    pieces = []
     try:
         with pa.CompressedInputStream(pa.BufferReader(data), codec) as stream:
-            while missing and (piece := stream.read(min(missing, PIECE))):
-                pieces.append(piece)
-                missing -= len(piece)
+            pieces.extend(up_to(stream, most, PIECE))
     except BROKEN as error:
         return b"".join(pieces), error
     return b"".join(pieces), None
