@@ -104,6 +104,16 @@ def test_help_follows_the_order_of_the_settings(capsys, monkeypatch):
     )  # fmt: skip
 
 
+def test_recordings_on_both_sides_of_an_option_are_told_to_stand_together(capsys):
+    assert cli.main("reconstruct a.aedat4 -o out b.aedat4".split()) == 1
+    error = capsys.readouterr().err
+    assert "b.aedat4 stands apart" in error and "side by side" in error
+    for line in ("reconstruct a -o out --no-such b", "train word -o out"):
+        with pytest.raises(SystemExit) as stop:  # what else tyro cannot read, it says itself
+            cli.main(line.split())
+        assert stop.value.code == 2 and "stands apart" not in capsys.readouterr().err
+
+
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
 @pytest.mark.parametrize("line", ["--help", "convert --help"])
 def test_what_cannot_be_printed_is_one_sentence(line):

@@ -9,11 +9,14 @@ import dataclasses
 import shlex
 import types
 import typing
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import docstring_parser
 import tyro
+
+from firenet_jax.errors import SettingsError
 
 METAVARS = {Path: "PATH", str: "TEXT", int: "NUMBER", float: "NUMBER", ...: "..."}
 POSITIONAL = typing.get_args(tyro.conf.Positional[int])[1]
@@ -24,14 +27,26 @@ def parse(settings: type, arguments: list[str], prog: str, description: str) -> 
     """The settings that the arguments say.
 
     Ends the program with exit code 2 where tyro cannot read them, and with 0 after the help. Raises
-    what the settings raise.
+    SettingsError for words that stand apart from others of their kind, and what the settings raise.
     """
-    copy = _copy(settings, None)
-    read = tyro.cli(
-        copy, prog=prog, description=description, args=arguments,
+    read_by = partial(
+        tyro.cli, _copy(settings, None), prog=prog, description=description, args=arguments,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
     )  # fmt: skip
-    return _original(settings, read)
+    read, unknown = read_by(return_unknown_args=True)
+    if unknown and not any(word.startswith("-") for word in unknown) and _takes_many(settings):
+        raise SettingsError(
+            f"{unknown[0]} stands apart from those before: name them all side by side, with the "
+            "options before or after them"
+        )
+    return _original(settings, read_by() if unknown else read)
+
+
+def _takes_many(settings: type) -> bool:
+    """Whether words without an option are any number of one kind."""
+    hints = typing.get_type_hints(settings, include_extras=True).values()
+    kinds = [typing.get_args(hint)[0] for hint in hints if POSITIONAL in typing.get_args(hint)]
+    return any(typing.get_origin(kind) is tuple for kind in kinds)
 
 
 def _copy(settings: type, default: Any, text: str | None = None) -> type:
