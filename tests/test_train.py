@@ -561,6 +561,7 @@ def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypa
         ({"data": (Path("a"),), "images": Path("b"), "scene": SceneSettings(shake=0.5)},
          "^images, shake: no part in training on sequences from --data"),
         ({"augment": Augment(hot_pixels=0)}, "^hot-pixels: no part in training on simulated"),
+        ({"images": Path("p"), "procedural": 1.0}, "^images: no part in training on procedural"),
         ({"sensor": SensorSettings(cutoff_dark=0.5)}, "--cutoff-dark says more of --cutoff"),
         ({"seed": -3}, "seed is -3"), ({"seed": 5_000_000_000}, "less than 2"),
     ],

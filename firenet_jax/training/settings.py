@@ -190,6 +190,8 @@ def _check_idle(settings: Train) -> None:
         check_none_idle(settings, SIMULATED, "training on sequences from --data")
     else:
         check_none_idle(settings, ["augment"], "training on simulated sequences")
+        if settings.procedural == 1:
+            check_none_idle(settings, ["images"], "training on procedural textures alone")
 
 
 def _check_step(settings: Train) -> None:
