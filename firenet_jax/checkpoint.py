@@ -57,6 +57,8 @@ def save_weights(path: str | Path, weights: Weights) -> None:
     Raises CheckpointError if the name does not end in .npz, if the arrays are not FireNet's or not
     finite, or if the file cannot be written.
     """
+    if not isinstance(weights, Weights):
+        raise TypeError("save_weights takes Weights(params, normalise), not the parameters alone")
     path = Path(path)
     if path.suffix != ".npz":
         raise CheckpointError(f"{path}: weights are written as .npz; give it that ending")

@@ -74,6 +74,12 @@ KEEP_FREED_MEMORY = (  # no heaps of threads (M_ARENA_MAX), M_MMAP_MAX, M_TRIM_T
     (-8, 1), (-4, 0), (-1, 2**31 - 1),
 )  # fmt: skip
 HUGE_PAGES = "glibc.malloc.hugetlb=1"
+# What Ctrl-C says of commands that go on where they were.
+GOES_ON = {
+    "reconstruct": "a folder of pictures goes on when run again",
+    "simulate": "a folder of sequences goes on when run again",
+    "evaluate": "the same command goes on with what is missing",
+}
 REPORT = (
     "firenet: this is a fault of firenet, not of yours: please report it, with the command and all "
     "these lines"
@@ -179,8 +185,8 @@ def main(arguments: list[str] | None = None) -> int:
         kind = getattr(command, name.capitalize())
         command.run(options.parse(kind, rest, f"firenet {name}", inspect.getdoc(kind) or ""))
     except KeyboardInterrupt as error:
-        goes_on = str(error) or "a folder of pictures or sequences goes on when run again"
-        print(f"firenet: interrupted; {goes_on}", file=sys.stderr)
+        goes_on = str(error) or GOES_ON.get(name)
+        print("firenet: interrupted" + (f"; {goes_on}" if goes_on else ""), file=sys.stderr)
         return 130
     except Exception as error:
         if isinstance(error, BrokenPipeError) and error.filename is None:

@@ -50,25 +50,38 @@ class Events:
     @classmethod
     def of(cls, t, x, y, p) -> "Events":
         """Columns of integers -> Events with the dtypes above; p is bool, 0 and 1, or -1 and 1.
-        Raises ValueError if the columns differ in length or the times are not whole microseconds.
-        `recording` and the readers check the values themselves."""
+        Raises ValueError unless the columns are flat and of one length, the times whole
+        microseconds and the coordinates whole numbers that int16 holds. `recording` and the readers
+        also check that events lie on the sensor, and in order of time."""
         t, x, y, p = map(np.asarray, (t, x, y, p))
-        if not t.shape == x.shape == y.shape == p.shape:
+        if not t.shape == x.shape == y.shape == p.shape or t.ndim != 1:
             raise ValueError(
                 f"columns differ in length: t {t.shape}, x {x.shape}, y {y.shape}, p {p.shape}"
+                if t.ndim == 1
+                else f"columns are of shape (N,), not {t.shape}"
             )
-        if t.dtype.kind == "f" and (t != np.rint(t)).any():
+        if t.dtype.kind == "f" and not (np.isfinite(t) & (t == np.rint(t))).all():
             raise ValueError("times must be whole microseconds: round 1e6 times seconds")
         return cls(
             t.astype(np.int64, copy=False),
-            np.asarray(x, np.int16),
-            np.asarray(y, np.int16),
+            _coordinates("x", x),
+            _coordinates("y", y),
             p if p.dtype == bool else p > 0,
         )
 
     @classmethod
     def empty(cls) -> "Events":
         return cls.of([], [], [], [])
+
+
+def _coordinates(name: str, column: np.ndarray) -> np.ndarray:
+    """As int16. Raises ValueError where that would be other coordinates."""
+    if column.dtype == np.int16 or not column.size:
+        return column.astype(np.int16, copy=False)
+    whole = column.dtype.kind in "biu" or (column == np.rint(column)).all()  # NaN differs, too
+    if not (whole and -(2**15) <= column.min() and column.max() < 2**15):
+        raise ValueError(f"{name} must be whole numbers of pixels, at most {2**15 - 1}")
+    return column.astype(np.int16)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -14,7 +14,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from firenet_jax import blocks
+from firenet_jax import blocks, native
 from firenet_jax.convolution import layer
 from firenet_jax.events import BINS
 
@@ -22,7 +22,7 @@ CHANNELS = 16
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["params"], meta_fields=["normalise"])
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Weights:
     """A trained network: its parameters, and whether it expects normalised tensors."""
 
@@ -47,8 +47,8 @@ class State(NamedTuple):
 
 def initial_state(batch: int, height: int, width: int) -> State:
     """The state before the first window: zeros."""
-    zeros = jnp.zeros((batch, height, width, CHANNELS), jnp.float32)
-    return State(zeros, zeros)
+    shape = batch, height, width, CHANNELS  # two arrays, so that a state can be donated
+    return State(jnp.zeros(shape, jnp.float32), jnp.zeros(shape, jnp.float32))
 
 
 class Conv(nn.Module):
@@ -155,7 +155,8 @@ def step(
 ) -> tuple[State, jax.Array]:
     """One window: (State, (B, H, W, 5)) -> (State, (B, H, W)).
 
-    On a CPU `native.step` computes the same where no gradient is needed.
+    Compiled once for each shape, also where it is called outside of `jax.jit`. On a CPU
+    `reconstruct` is quicker: all of a window in one piece of machine code (`native.step`).
 
     event_tensor: normalised if the weights expect it (`tensors.normalise`).
     exists: (B,) bool; where False the state is unchanged and the image is undefined (the event
@@ -164,8 +165,14 @@ def step(
     """
     if isinstance(params, Weights):
         raise TypeError("step takes the parameters alone: pass weights.params")
+    return _step(params, state, event_tensor, exists, native.is_wanted(), dtype)
+
+
+@partial(jax.jit, static_argnums=(4, 5), inline=True)
+def _step(params, state, event_tensor, exists, machine_code: bool, dtype):
     network: Any = FireNet(dtype)  # flax does not say what `apply` returns
-    return network.apply({"params": params}, state, event_tensor, exists)
+    with native.by_xla_alone(not machine_code):
+        return network.apply({"params": params}, state, event_tensor, exists)
 
 
 def initial_params(key: jax.Array):

@@ -68,8 +68,8 @@ class DisplayState(NamedTuple):
 
 def initial_display_state(batch: int) -> DisplayState:
     """The state before the first image."""
-    nothing = jnp.full((batch, HISTORY), jnp.nan, jnp.float32)
-    return DisplayState(nothing, nothing)
+    low, high = (jnp.full((batch, HISTORY), jnp.nan, jnp.float32) for _ in range(2))
+    return DisplayState(low, high)
 
 
 def _unsharp_weights() -> np.ndarray:
@@ -120,7 +120,13 @@ def display(
     `automatic_range`, or of clip(min, 0, 0.45) and clip(max, 0.55, 1). Where the range is fixed the
     state is not used.
     valid: (T, B) bool; images that are not valid leave the state as it was. None: all are.
+    Raises ValueError for images of another shape, or a state of another number of recordings.
     """
+    if images.ndim != 4 or len(state.low) != images.shape[1]:
+        raise ValueError(
+            f"images of shape {images.shape} and the state of {len(state.low)} recordings: "
+            "expected (T, B, H, W), and a state of B"
+        )
     if settings.unsharp:
         images = unsharp_mask(images, settings.unsharp)
     if settings.range == "fixed":
@@ -158,7 +164,8 @@ def automatic_range(images: jax.Array) -> tuple[jax.Array, jax.Array]:
     if min(height, width) > 4 * BORDER:
         images = images[..., BORDER:-BORDER, BORDER:-BORDER]
     step = max(1, math.isqrt(height * width // SAMPLES))
-    sampled = images[..., ::step, ::step].reshape(*images.shape[:-2], -1)
+    sampled = images[..., ::step, ::step]
+    sampled = sampled.reshape(*images.shape[:-2], math.prod(sampled.shape[-2:]))
     low, high = jnp.quantile(sampled, jnp.array([BEYOND, 1 - BEYOND]), axis=-1)
     margin = MARGIN * (high - low)
     missing = jnp.maximum(NARROWEST - (high - low + 2 * margin), 0)

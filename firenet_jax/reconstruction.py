@@ -21,7 +21,7 @@ from jax.sharding import Mesh
 from firenet_jax import colour, native
 from firenet_jax.devices import BATCH, REPLICATED, TIME_BATCH, on_each_device
 from firenet_jax.errors import logger
-from firenet_jax.events import Recording, check_recording
+from firenet_jax.events import Recording, check_recording, until_damage
 from firenet_jax.instants import WARM_UP, Counts, Grid, Step, check, steps, warming
 from firenet_jax.network import BINS, CHANNELS, State, Weights, initial_params, initial_state, step
 from firenet_jax.pictures import (
@@ -291,7 +291,8 @@ def images_at(
     times: microseconds on the recording's clock, in order; may be endless, such as `fj.grid`. Times
     before the first event or after the last one get no image.
     windows: those that update the state, as `windows.Windows` takes them; default: 0.35 events per
-    pixel, at most 40 ms, as in `firenet reconstruct`. An image depends on these and on the events
+    pixel, at most 40 ms, or a twentieth of a recording shorter than 0.8 s, as in
+    `firenet reconstruct`. An image depends on these and on the events
     up to its time and those of the warm-up, not on which other times are requested.
     chunk: steps per call of the device. Memory holds one chunk, whatever the recording's length.
     warm_up: windows of the beginning that the network sees beforehand, see `instants.warming`.
@@ -302,7 +303,7 @@ def images_at(
     if warm_up < 0:
         raise ValueError(f"warm_up is {warm_up}, but must be 0 or more windows")
     check_recording(recording)
-    chosen = Windows(**windows) if windows else usual(recording.events())
+    chosen = Windows(**windows) if windows else usual(until_damage(recording.events()))
     check(chosen)
     state = initial_state(1, recording.height, recording.width)
     committed = Committed(state, state)

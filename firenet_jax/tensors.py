@@ -68,17 +68,23 @@ def pack(
     """T rows of B windows -> one flat list for the device.
 
     size: padded length, at least the number of events; None: `capacity` of that number.
-    bounds: (T, B, 2) int64 microseconds, t_min and t_max of each window; None: the times of its
-    first and last event.
-    Raises ValueError if rows are missing or of unequal length, if times are not whole microseconds,
-    if the events do not fit into `size`, or if there are 2^15 windows or more.
+    bounds: (T, B, 2) int64 microseconds, t_min and t_max of each window; None: its least and
+    greatest time.
+    Raises ValueError if rows are missing or of unequal length, if columns have not the dtypes of
+    `Events`, if bounds are of another shape, not whole or end before they begin, if the events do
+    not fit into `size`, or if there are 2^15 windows or more.
     """
     if not windows or not windows[0] or {len(row) for row in windows} != {len(windows[0])}:
         raise ValueError("windows are T rows of B windows each, T and B at least 1")
     shape = len(windows), len(windows[0])
     flat = [window for row in windows for window in row]
-    if any(window.t.dtype.kind == "f" for window in flat):  # seconds would all become one time
-        raise ValueError("times of events are whole microseconds, int64: make them by Events.of")
+    for name, kind in (("t", "iu"), ("x", "iu"), ("y", "iu"), ("p", "b")):
+        # Seconds would all become one time, and -1 would be true as 1 is.
+        if any(getattr(window, name).dtype.kind not in kind for window in flat):
+            raise ValueError(
+                "events are t int64 whole microseconds, x and y int16, p bool: make them by "
+                f"Events.of ({name} is of another kind)"
+            )
     counts = np.array([len(window) for window in flat])
     size = capacity(counts.sum()) if size is None else size
     if counts.sum() > size:
@@ -89,8 +95,12 @@ def pack(
             f"batch, fewer than {2**15} windows at once"
         )
     if bounds is None:
-        bounds = np.array([(w.t[0], w.t[-1]) if len(w) else (0, 0) for w in flat], np.int64)
+        bounds = np.array([(w.t.min(), w.t.max()) if len(w) else (0, 0) for w in flat], np.int64)
+    elif np.shape(bounds) != (*shape, 2) or np.asarray(bounds).dtype.kind not in "iu":
+        raise ValueError(f"bounds are whole microseconds of shape {(*shape, 2)}")
     t_min, t_max = np.asarray(bounds, np.int64).reshape(-1, 2).T
+    if (t_min > t_max).any():
+        raise ValueError("bounds are t_min and t_max: a window ends before it begins")
 
     packed = Packed(
         *_columns(size, (np.int32, np.int16, np.int16, bool, np.int16)),
@@ -232,7 +242,7 @@ def normalise(tensors: jax.Array) -> jax.Array:
     mean = tensors.sum(axes, keepdims=True) / count
     centred = jnp.where(voted, tensors - mean, 0.0)
     variance = (centred**2).sum(axes, keepdims=True) / count
-    usable = variance >= 1e-12
+    usable = ~(variance < 1e-12)  # what is not finite stays so, and is not taken for nothing
     return jnp.where(usable, centred / jnp.sqrt(jnp.where(usable, variance, 1.0)), 0.0)
 
 

@@ -132,3 +132,21 @@ def test_version_and_a_short_repr_of_weights():
     assert repr(fj.load_weights()) == "Weights(37,777 parameters, normalise=True)"
     numbers = fj.Weights({"kernel": 1.0, "bias": 2.0}, normalise=False)
     assert repr(numbers) == "Weights(2 parameters, normalise=False)"
+
+
+@pytest.mark.parametrize(
+    "unit, first, said",
+    [
+        ("s", 1000.0, "by 61 us"),
+        (None, 1000.0, "by 61 us"),
+        ("ms", 1e6, "by 62.5 us"),
+        ("us", 3e7, "by 2 us"),
+    ],
+)
+def test_times_of_few_digits_are_said(unit, first, said, caplog):
+    t = np.array([first, first + 8, first + 16], np.float32)
+    fj.recording(t, X[:3], Y[:3], P[:3], unit=unit, **SIZE)
+    assert f"tells these times apart {said}" in caplog.text
+    caplog.clear()
+    fj.recording(np.array([0.5, 1.25, 7.0], np.float32), X[:3], Y[:3], P[:3], **SIZE)
+    assert "apart" not in caplog.text

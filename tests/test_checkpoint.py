@@ -17,6 +17,7 @@ from firenet_jax.checkpoint import (
     save_weights,
 )
 from firenet_jax.commands.convert import Convert, run
+from firenet_jax.export.tensors_file import pth
 from firenet_jax.network import Weights, initial_params, initial_state, step
 
 # name in PyTorch -> shape there, as the two published families list them
@@ -401,3 +402,23 @@ def test_what_is_already_converted_is_said(tmp_path, monkeypatch, given):
     with pytest.raises(CheckpointError, match="are used as they are, and `firenet export` makes"):
         run(Convert(Path(given), tmp_path / "out.npz"))
     assert not (tmp_path / "out.npz").exists()
+
+
+def test_parameters_alone_are_not_saved(tmp_path):
+    with pytest.raises(TypeError, match="takes Weights"):
+        save_weights(tmp_path / "a.npz", initial_params(jax.random.key(0)))
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names")
+def test_convert_reads_files_and_follows_links(tmp_path):
+    os.mkfifo(tmp_path / "pipe.pth")
+    with pytest.raises(CheckpointError, match="is a pipe or device"):
+        run(Convert(tmp_path / "pipe.pth", tmp_path / "a.npz"))
+    weights = Weights(initial_params(jax.random.key(0)), True)
+    (tmp_path / "a.pth").write_bytes(pth(weights))
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "w.npz").write_bytes(b"old")
+    (tmp_path / "w.npz").symlink_to("there/w.npz")
+    run(Convert(tmp_path / "a.pth", tmp_path / "w.npz", overwrite=True))
+    assert (tmp_path / "w.npz").is_symlink()
+    assert load_weights(tmp_path / "there" / "w.npz").normalise

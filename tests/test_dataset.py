@@ -336,6 +336,32 @@ def test_runs_of_other_numbers_of_processes_do_not_take_each_others_files(tmp_pa
     assert not partial.exists() and (tmp_path / "train" / "000001.h5").exists()
 
 
+def test_a_run_that_could_not_begin_is_begun_again(tmp_path, monkeypatch):
+    """Settings are written before any folder, which alone could be anyone's."""
+
+    def full(path, text):
+        raise OutputError("no room")
+
+    with monkeypatch.context() as patch, pytest.raises(OutputError, match="no room"):
+        patch.setattr("firenet_jax.commands.simulate.write_text", full)
+        run(settings(tmp_path / "set", sequences=1, validation=0))
+    assert len(run(settings(tmp_path / "set", sequences=1, validation=0))) == 1
+
+
+@pytest.mark.parametrize("held", [{}, {"seed": 7, "fps": 30}])
+def test_settings_of_something_else_stay(tmp_path, held):
+    (tmp_path / "settings.json").write_text(json.dumps(held))
+    with pytest.raises(OutputError, match="is of something else"):
+        run(settings(tmp_path, sequences=1, validation=0))
+    assert json.loads((tmp_path / "settings.json").read_text()) == held
+
+
+def test_a_size_may_be_written_in_several_ways():
+    sizes = ("48x40", "48X40", "048x40")
+    records = [dataset.describe(Simulate(Path("a"), sensor_size=size)) for size in sizes]
+    assert records[0] == records[1] == records[2] and records[0]["sensor_size"] == "48x40"
+
+
 def test_overwrite_is_of_a_video():
     with pytest.raises(SettingsError, match="overwrite: no part in simulating scenes"):
         Simulate(Path("set"), overwrite=True)
@@ -591,6 +617,10 @@ def test_everything_wrong_is_one_sentence(tmp_path, monkeypatch, capsys):
             "fps, objects: no part in turning",
         ),
         ("-o new.h5 --video clip.mp4 --flicker .1 .9", "too far apart to show it"),
+        (
+            "-o new.h5 --video clip.mp4 --process 1 --processes 2",
+            "process, processes: no part in turning",
+        ),
     ],
 )
 def test_settings_that_cannot_be_are_said(capsys, line, expected):

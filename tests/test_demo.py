@@ -137,3 +137,12 @@ def test_nothing_is_left_of_a_demo_that_is_interrupted(tmp_path, weights, monkey
     line = f"demo -o {tmp_path}/demo.mp4 -c {weights} --seconds 0.5 --sensor-size 48x32"
     assert cli.main(line.split()) == 130
     assert [path.name for path in tmp_path.iterdir()] == ["weights.npz"]
+
+
+def test_an_interrupted_reconstruction_is_not_lost_to_a_demo(tmp_path, weights, capsys):
+    (tmp_path / "out.partial").mkdir()
+    (tmp_path / "out.partial" / "resume.npz").write_bytes(b"hours")
+    line = f"demo -o {tmp_path}/out -c {weights} --seconds 0.1 --sensor-size 48x32"
+    assert cli.main(line.split()) == 1
+    assert "holds an unfinished reconstruction" in capsys.readouterr().err
+    assert (tmp_path / "out.partial" / "resume.npz").read_bytes() == b"hours"

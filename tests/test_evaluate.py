@@ -32,9 +32,9 @@ from firenet_jax.evaluation import comparison, methods, metrics, protocol
 from firenet_jax.evaluation.baselines import e2vid
 from firenet_jax.evaluation.baselines.high_pass import HighPass
 from firenet_jax.evaluation.comparison import COMPARED, Gap, matched
-from firenet_jax.evaluation.methods import Missing, filtered, load, recurrent_unet
+from firenet_jax.evaluation.methods import Missing, digest, filtered, load, recurrent_unet
 from firenet_jax.evaluation.protocol import CUTS, displacement, plan
-from firenet_jax.evaluation.report import METRICS, _best, notes
+from firenet_jax.evaluation.report import METRICS, _best, about, notes
 from firenet_jax.evaluation.report import steps as ticks_of
 from firenet_jax.events import Events, concatenate
 from firenet_jax.instants import steps
@@ -221,7 +221,7 @@ def test_the_page_says_when_by_what_and_what_each_method_is(evaluated):
     for said in (
         f"{datetime.date.today().isoformat()}, firenet_jax {firenet_jax.__version__}; settings: ",
         "equalise none",
-        "ours: FireNet (Scheerlinck et al. 2020) with the weights of this name",
+        "ours: FireNet (Scheerlinck et al. 2020), with the weights of this name",
         "e2vid-random: E2VID with random weights: its images mean nothing",
         "hf: high-pass filter (Scheerlinck et al. 2018), not learned",
         "mr: manifold regularisation (Reinbacher et al. 2016), not learned",
@@ -393,7 +393,10 @@ def test_other_settings_are_refused_by_name_and_replaced_when_told(folder, tmp_p
     with pytest.raises(OutputError, match="something else"):
         run(settings(folder, tmp_path / "mine", **other))
     (tmp_path / "mine" / "results").mkdir()
-    for name, text in (("index.html", "mine"), ("results.json", '{"mine": 1}')):
+    for name, text in (
+        ("index.html", "mine"), ("results.json", '{"mine": 1}'), ("main.py", "mine"),
+        ("results/notes.txt", "mine"),
+    ):  # fmt: skip
         (tmp_path / "mine" / name).write_text(text)
         with pytest.raises(OutputError, match="something else"):
             run(settings(folder, tmp_path / "mine", **other))
@@ -915,3 +918,31 @@ def test_the_best_is_the_least_distance_and_the_greatest_similarity():
     }
     assert _best(entries, "mse") == "0.0100" and _best(entries, "ssim") == "0.900"
     assert _best({"a": entries["a"], "c": entries["c"]}, "mse") is None
+
+
+def test_what_became_a_gap_leaves_nothing_of_other_settings(folder, tmp_path):
+    choices = {"data": (folder / "data",), "methods": "hf", "output": tmp_path / "out"}
+    run(Evaluate(**choices))
+    assert (tmp_path / "out" / "videos" / "data-a.mp4").is_file()
+    last = open_recording(folder / "data" / "a.h5").frames.times[-1]
+    later = choices | {"start": 1e-6 * last + 0.001}
+    results = run(Evaluate(**later, overwrite=True))
+    assert "gap" in results["sequences"]["data-a"]["methods"]["hf"]
+    assert not (tmp_path / "out" / "videos" / "data-a.mp4").exists()
+    run(Evaluate(**later))  # nothing of before is in its way
+
+
+def test_a_recording_that_is_named_twice_is_refused(folder, tmp_path):
+    data = (folder / "data", folder / "data" / "a.h5")
+    with pytest.raises(RecordingError, match="are the same recording: name it once"):
+        run(Evaluate(output=tmp_path / "out", data=data, methods="hf"))
+
+
+def test_the_page_knows_weights_by_what_they_are():
+    ours = {"method": "firenet", "normalise": True, "weights": digest(load_weights())}
+    assert about("mine", ours).endswith("the weights of this package")
+    for name in ("firenet", "mr", "hf"):
+        said = about(name, ours | {"weights": "other"})
+        assert said == "FireNet (Scheerlinck et al. 2020), with the weights of this name"
+    assert about("e2vid", None).startswith("E2VID")
+    assert about("e2vid-random", {"method": "e2vid"}).startswith("E2VID with random weights")

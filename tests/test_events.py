@@ -287,3 +287,15 @@ def test_as_few_as_possible_are_left_out_across_chunks():
     assert [t for part in found for t, _ in part] == [*range(4000), *range(4000, 6000)]
     one = [many(0, then=[9000]), many(2000, 2), many(9001)]
     assert "left out: 1 of 4,003 events" in passed(one, strict=False)[1][0]
+
+
+@pytest.mark.parametrize(
+    "t, x, message",
+    [([0], [65541], "x must be whole numbers of pixels"), ([0], [1.7], "x must be whole"),
+     ([0], [np.nan], "x must be whole"), ([np.inf], [1], "whole microseconds"),
+     ([[0, 1]], [[1, 2]], r"of shape \(N,\), not \(1, 2\)")],
+)  # fmt: skip
+def test_columns_that_would_become_other_events_are_refused(t, x, message):
+    y = p = np.ones_like(np.asarray(t), int)
+    with pytest.raises(ValueError, match=message):
+        Events.of(t, x, y, p)

@@ -688,3 +688,31 @@ def test_seconds_count_from_the_first_look_at_the_source(tmp_path, monkeypatch, 
     assert cli.main(["live", "empty.txt", *end.split()]) == 0
     said = capsys.readouterr().out
     assert "0 pictures of 0 events" in said and "None" not in said
+
+
+def test_wrong_times_now_and_then_do_not_stop_all():
+    chunks = [some_events(10, last=900, seed=n, start=1000 * n) for n in range(600)]
+    wrong = Events.of([2**50], [1], [1], [1])
+    for n in range(100, 600, 50):
+        parts = chunks[n].select(slice(4)), wrong, chunks[n].select(slice(4, None))
+        chunks[n] = concatenate(parts)
+    figures = Figures()
+    found = concatenate([*sound(chunks, 12, 20, figures)])
+    assert (figures.events, figures.bad, len(found)) == (6010, 10, 6000)
+    assert (np.diff(found.t) >= 0).all() and found.t[-1] < 600_000
+    # The last of a chunk cannot be told from a pause: a thousand events later it goes on from it.
+    chunks[100] = concatenate([chunks[100], wrong])
+    figures = Figures()
+    found = concatenate([*sound(chunks, 12, 20, figures)])
+    assert figures.bad < 1100 and found.t[-1] > 2**50
+
+
+@pytest.mark.parametrize("speed", [1e20, 1e308, 1e-300])
+def test_a_speed_that_no_clock_has_is_refused(speed):
+    with pytest.raises(ValueError, match="a millionth to a million times"):
+        live.Live("a.h5", replay=True, speed=speed)
+
+
+def test_before_the_first_picture_there_is_an_empty_one():
+    number, data = Board().newest(-1)
+    assert number == 0 and Image.open(io.BytesIO(data)).size == (1, 1)

@@ -11,7 +11,15 @@ from jax.extend.core import jaxprs_in_params
 
 from firenet_jax import native
 from firenet_jax.checkpoint import convert
-from firenet_jax.network import Weights, initial_params, initial_state, multiply_adds, step
+from firenet_jax.network import (
+    Weights,
+    _step,
+    initial_params,
+    initial_state,
+    multiply_adds,
+    step,
+)
+from firenet_jax.pictures import display, initial_display_state
 from firenet_jax.reconstruction import reconstruct
 
 
@@ -180,3 +188,51 @@ def test_bfloat16_stays_close_and_keeps_float32_state():
     state, images = reconstruct(weights, state, tensors, dtype=jnp.bfloat16)
     assert images.dtype == state.g1.dtype == jnp.float32
     assert 0 < np.abs(images - exact).max() < 0.05
+
+
+def test_outside_of_programs_a_step_is_compiled_once():
+    params, tensors = random_run(steps=2, batch=1, height=9, width=10)
+    state, compiled = initial_state(1, 9, 10), []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, seconds, **info: compiled.append(info) if "backend_compile" in event else None
+    )
+    try:
+        for k in range(3):
+            state, _ = step(params, state, tensors[k % 2])
+            if k == 0:
+                assert compiled
+                jax.block_until_ready(state)
+                compiled.clear()
+        assert not compiled
+    finally:
+        jax.monitoring.clear_event_listeners()
+    with native.by_xla_alone():  # another program, although the shapes are the same
+        step(params, state, tensors[0])
+    assert _step._cache_size() >= 2
+
+
+def test_a_state_can_be_donated():
+    params, tensors = random_run(steps=1, batch=1, height=9, width=10)
+    expected = step(params, initial_state(1, 9, 10), tensors[0])
+    actual = jax.jit(step, donate_argnums=1)(params, initial_state(1, 9, 10), tensors[0])
+    for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+    images = jnp.zeros((1, 2, 12, 13))
+    donating = jax.jit(display, donate_argnums=0)
+    donating(initial_display_state(2), images)
+
+
+def test_weights_are_told_apart_by_identity():
+    weights = Weights(initial_params(jax.random.key(0)), True)
+    assert weights == weights and weights != Weights(weights.params, True)
+    assert len({weights, weights}) == 1
+
+
+@pytest.mark.parametrize("machine_code", [True, False])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_is_not_finite_is_not_taken_for_an_empty_window(value, machine_code):
+    params, tensors = random_run(steps=2, batch=1, height=9, width=10)
+    tensors = jnp.asarray(tensors).at[0, 0, 4, 4, 2].set(value)
+    weights = Weights(params, True)
+    _, images = reconstruct(weights, initial_state(1, 9, 10), tensors, machine_code=machine_code)
+    assert not np.isfinite(images[0]).any()

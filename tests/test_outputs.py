@@ -220,7 +220,7 @@ def test_what_a_bag_cannot_say(tmp_path):
     writer = BagWriter(tmp_path / "a.bag", "/image", "cam0")
     with pytest.raises(RecordingError, match="ROS counts from 0"):
         writer.write(pictures()[0], -1)
-    for topic in ("", "/", "a b", "/cam0//image", "9a"):
+    for topic in ("", "/", "a b", "/cam0//image", "9a", "/caméra", "/a~b", "/~"):
         with pytest.raises(ValueError, match="topic is"):
             check_topic(topic)
     for topic in ("/cam0/image_raw", "image", "~/image"):

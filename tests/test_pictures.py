@@ -206,3 +206,16 @@ def test_event_pictures_are_white_where_events_cancel():
     assert np.asarray(tensors.sum(-1)).ravel()[cancel].any()
     pictures = np.asarray(event_pictures(tensors))[0, 0, 0]
     np.testing.assert_array_equal((pictures == 255).all(-1), cancel)
+
+
+@pytest.mark.parametrize("range", ["auto", "fixed"])
+def test_no_windows_are_no_pictures(range):
+    state = initial_display_state(1)
+    _, pictures = display(state, jnp.zeros((0, 1, 8, 9)), settings=Display(range=range))
+    assert pictures.shape == (0, 1, 8, 9)
+
+
+@pytest.mark.parametrize("shape", [(3, 8, 9), (3, 2, 8, 9)])
+def test_images_of_another_shape_are_refused(shape):
+    with pytest.raises(ValueError, match=r"the state of 1 recordings: expected \(T, B, H, W\)"):
+        display(initial_display_state(1), jnp.zeros(shape))

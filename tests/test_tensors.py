@@ -3,6 +3,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -341,3 +342,32 @@ def test_after_a_chunk_of_many_events_one_of_few_does_not_recompile():
     voxelise.clear_cache()
     assert len(list(event_tensors(recording, duration=1, chunk=1))) == 3
     assert voxelise._cache_size() == 1
+
+
+def test_events_in_any_order_have_the_same_tensor():
+    """Times of a window are its least and greatest."""
+    events = random_events(np.random.default_rng(9), 300)
+    mixed = events.select(np.random.default_rng(10).permutation(300))
+    np.testing.assert_allclose(tensor_of(mixed), tensor_of(events), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "name, column",
+    [("p", np.array([-1, 1])), ("x", np.array([1.0, 2.0])), ("y", np.array([1.0, 2.0])),
+     ("t", np.array([0.1, 0.2]))],
+)  # fmt: skip
+def test_columns_of_another_kind_are_refused(name, column):
+    """-1 would become brighter, and seconds one time."""
+    events = replace(Events.of([0, 5], [1, 2], [3, 4], [0, 1]), **{name: column})
+    with pytest.raises(ValueError, match=rf"make them by Events.of \({name} is of another kind"):
+        pack([[events]])
+
+
+@pytest.mark.parametrize(
+    "bounds, message",
+    [([[[9, 0]]], "ends before it begins"), ([[[0.0, 0.05]]], "whole microseconds of shape"),
+     ([[[0], [9]]], r"of shape \(1, 1, 2\)")],
+)  # fmt: skip
+def test_bounds_that_cannot_be_are_refused(bounds, message):
+    with pytest.raises(ValueError, match=message):
+        pack([[Events.of([0, 5], [1, 2], [3, 4], [0, 1])]], bounds=np.array(bounds))

@@ -139,6 +139,8 @@ def test_numbers_beyond_all_times_lie_outside(tmp_path, recording):
     assert found[:2].tolist() == [5_250_000, 5_500_000] and found[2] == MAX_TIME
     found = read(tmp_path, recording, "5.5e-9999999999999999999\n5.25\n", unit="s", since="zero")
     assert found.tolist() == [0, 5_250_000]
+    with pytest.raises(RecordingError, match="line 2: expected a time"):  # int() takes 4,300 digits
+        read(tmp_path, recording, f"5.25\n1e{'9' * 5000}\n")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pipes with names")

@@ -386,6 +386,26 @@ def test_a_page_in_the_folder_that_one_is_in(tmp_path, capsys, monkeypatch, runt
     assert code == 1 and "exists" in error
 
 
+def test_a_page_is_made_within_its_folder(tmp_path, capsys, monkeypatch, runtime):
+    """Which may be a link to another disk; what fails leaves no folder."""
+    (tmp_path / "other").mkdir()
+    (tmp_path / "page").symlink_to("other")
+    seen = []
+    replaced = Path.replace
+
+    def replace(path, place):
+        seen.append(path)
+        return replaced(path, place)
+
+    monkeypatch.setattr(Path, "replace", replace)
+    assert firenet(capsys, "export --web page --sample a.txt")[0] == 0
+    assert seen and all(path.parts[0] == "page" for path in seen)
+    assert not [path for path in (tmp_path / "other").iterdir() if "partial" in path.name]
+    (runtime / "dist" / FILES[0]).unlink()
+    assert firenet(capsys, "export --web new --sample a.txt")[0] == 1
+    assert not (tmp_path / "new").exists()
+
+
 def test_a_folder_beside_a_page_stays(tmp_path, capsys, runtime):
     """Its name is that under which other outputs are made."""
     (tmp_path / "page.partial").mkdir()

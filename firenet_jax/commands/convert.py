@@ -8,6 +8,8 @@ import jax
 import tyro
 
 from firenet_jax.checkpoint import BUILT_IN, CheckpointError, convert, save_weights
+from firenet_jax.storage.files import check_no_pipe
+from firenet_jax.storage.video import followed
 
 
 @dataclass(frozen=True)
@@ -37,8 +39,9 @@ def run(settings: Convert) -> None:
             f"{given}: is not a PyTorch checkpoint; weights of this program are used as they are, "
             "and `firenet export` makes .pth, .onnx and others of them"
         )
+    check_no_pipe(given, CheckpointError)
     weights = convert(given)
-    save_weights(settings.output, weights)
+    save_weights(followed(settings.output), weights)
     count = sum(value.size for value in jax.tree.leaves(weights.params))
     tensors = "normalised" if weights.normalise else "raw"
     print(f"{settings.output}: {count:,} parameters, for {tensors} event tensors")

@@ -17,7 +17,7 @@ import tyro
 from PIL import Image, ImageDraw, ImageFont
 
 from firenet_jax.checkpoint import load_weights
-from firenet_jax.errors import SettingsError
+from firenet_jax.errors import OutputError, SettingsError
 from firenet_jax.evaluation.metrics import mse, ssim, temporal_error
 from firenet_jax.network import Weights, initial_state
 from firenet_jax.pictures import DisplayState, display, event_pictures, initial_display_state
@@ -28,6 +28,7 @@ from firenet_jax.simulation.sensor import FAULTY, Sensor, SensorSettings, random
 from firenet_jax.simulation.textures import HELD_OUT, load_textures, photographs
 from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import bar
+from firenet_jax.storage.resume import position_file
 from firenet_jax.storage.video import check_output, followed, open_writer
 
 WINDOWS_AT_ONCE = 10  # simulated and reconstructed at once
@@ -94,6 +95,11 @@ def run(settings: Demo) -> dict[str, float]:
     weights = load_weights(settings.weights)
     output = followed(settings.output)
     check_output(output, settings.overwrite)
+    if position_file(output).exists() and not settings.overwrite:
+        raise OutputError(
+            f"{position_file(output).parent} holds an unfinished reconstruction: remove it or pass "
+            "--overwrite"
+        )
     height, width = parse_size(settings.sensor_size)
     count = max(round(settings.seconds * settings.fps), 1)
     period = 1e6 / settings.fps

@@ -231,8 +231,9 @@ def compute(
 
 def find_sequences(paths: tuple[Path, ...]) -> dict[str, Path]:
     """Recordings and folders of them -> name: path. Raises RecordingError for an empty folder and
-    for two of one name."""
+    for two of one name, and for one that is named twice."""
     found: dict[str, Path] = {}
+    places: dict[Path, Path] = {}
     for path in paths:
         inside = [path]
         if path.is_dir() and not is_recording(path):
@@ -247,6 +248,10 @@ def find_sequences(paths: tuple[Path, ...]) -> dict[str, Path]:
             if name in found:
                 raise RecordingError(
                     f"{found[name]} and {recording} are both named {name}: rename one of them"
+                )
+            if (first := places.setdefault(recording.resolve(), recording)) is not recording:
+                raise RecordingError(
+                    f"{first} and {recording} are the same recording: name it once"
                 )
             found[name] = recording
     return found
@@ -291,6 +296,8 @@ def describe(settings: Evaluate, learned: lpips.Lpips | None) -> dict:
     names = ("events", "duration", "keep_ratio", "seed", "start", "stop", "warm_up", "tolerance",
              "equalise", "sensor_size")  # fmt: skip
     record = {name: getattr(settings, name) for name in names}
+    if size := parse_size(settings.sensor_size):  # as it may be written in several ways
+        record["sensor_size"] = f"{size[1]}x{size[0]}"
     record["lpips"] = None if learned is None else digest(learned)
     if settings.times.wanted:
         record["images_at"] = asked(settings.times)
@@ -319,8 +326,9 @@ def open_folder(
     folder = settings.output
     report = read_record(folder / "results.json", "choose another output")
     mine = report is None or {"protocol", "sequences"} <= report.keys()
-    if report is None:  # it is written before the others
-        mine = not any((folder / name).exists() for name in ("table.csv", "index.html"))
+    if report is None:  # it is written before all others, but for the results of each
+        mine = all(path.name.startswith("results") for path in folder.iterdir())
+        mine = mine and all(path.is_dir() for path in folder.glob("results/*"))
     if any(folder.iterdir()) and not ((folder / "results").is_dir() and mine):
         raise OutputError(f"{folder} is a folder of something else: choose another output")
     done = {}
@@ -343,6 +351,9 @@ def open_folder(
             )  # fmt: skip
         if not differences(was, record):
             done[key] = result
+        else:  # what takes its place may be a gap
+            path.unlink()
+            path.with_suffix(".npz").unlink()
     for key in records:
         make_folder(result_file(settings, *key).parent)
     if done:
@@ -439,9 +450,9 @@ def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
         for number, images in side_by_side("stills")
     ]
     clip = list(side_by_side("clip"))
-    video = None
+    video, path = None, settings.output / "videos" / f"{plan.name}.mp4"
+    path.unlink(missing_ok=True)  # it may be of other settings
     if len(clip) > 1:
-        path = settings.output / "videos" / f"{plan.name}.mp4"
         path.parent.mkdir(exist_ok=True)
         step = np.median(np.diff([int(times[number]) for number, _ in clip])) / 1e6
         coarser = -(-len(clip[0][1]) * plan.recording.width // MAX_VIDEO_WIDTH)

@@ -77,6 +77,8 @@ class Live:
 
     def __post_init__(self):
         check_sizes(self, "speed", "repeat", "behind", "seconds")
+        if not 1e-6 <= self.speed <= 1e6:
+            raise SettingsError(f"speed is {self.speed:g}, but is a millionth to a million times")
         if not 0 <= self.port < 2**16:
             raise SettingsError(f"port is {self.port}, but ports are 0 to 65535")
         Windows(events_per_pixel=self.events_per_pixel, longest=self.longest)  # checks them

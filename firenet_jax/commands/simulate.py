@@ -53,6 +53,7 @@ from firenet_jax.storage.files import (
 from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import bar
 from firenet_jax.storage.sequence_file import Picture, write_sequence
+from firenet_jax.storage.video import followed
 
 FLOW_BITS = 11  # of the fastest pixel's flow, see `rounded_flow`
 SEQUENCES_PER_POOL = 32  # sequences that share a pool of textures
@@ -134,7 +135,8 @@ class Simulate:
         share(self.process, self.processes)
         check_idle(with_faults(self.sensor) if self.faults else self.sensor)
         if self.video is not None:
-            check_none_idle(self, OF_SCENES, "turning a video into events")
+            names = [*OF_SCENES, "process", "processes"]
+            check_none_idle(self, names, "turning a video into events")
             if self.sensor.flicker is not None:
                 raise SettingsError(
                     "flicker: pictures of a video are too far apart to show it: leave it out"
@@ -219,7 +221,7 @@ def write_sequences(
                 # The first few sequences say little about the size of all.
                 rest = len(missing) - done
                 expected = rest if done >= MIN_SAMPLE else min(rest, MIN_SAMPLE)
-                _check_room(settings.output, used / done * expected)
+                _check_room(settings.output, processes * used / done * expected)  # all share it
             key = jax.random.key(settings.seed)
             for fold in (part, number):
                 key = jax.random.fold_in(key, fold)
@@ -318,7 +320,7 @@ def describe(settings: Simulate) -> dict:
         settings,
         but=UNRECORDED,
         images=None if settings.images is None else settings.images.resolve(),
-        sensor_size=settings.sensor_size or "240x180",
+        sensor_size="{1}x{0}".format(*parse_size(settings.sensor_size or "240x180")),
         version=importlib.metadata.version("firenet-jax"),
     )
 
@@ -334,19 +336,19 @@ def open_folder(settings: Simulate) -> None:
             "output"
         )
     empty = not next(folder.glob("*/??????.h5"), None)
-    if found is not None and empty and (others := found.keys() - record.keys()):
-        raise OutputError(
-            f"{kept} is of something else (it says {min(others)}): choose another output"
-        )
+    if found is not None and empty and not {"version", "scene"} <= found.keys() <= record.keys():
+        others = found.keys() - record.keys()
+        said = f" (it says {min(others)})" if others else ""
+        raise OutputError(f"{kept} is of something else{said}: choose another output")
     if found is not None and not empty:
         runs.check_same(
             found, record, f"{folder} holds sequences of other settings",
             "choose another output, or go on with the same settings",
         )  # fmt: skip
+    if found is None or runs.differences(found, record):  # first: folders alone are anyone's
+        write_text(kept, runs.as_text(record) + "\n")
     for name in ("train", "validation"):
         runs.make_folder(folder / name)
-    if found is None or runs.differences(found, record):
-        write_text(kept, runs.as_text(record) + "\n")
 
 
 def in_words(size: float) -> str:
@@ -369,7 +371,7 @@ def _check_room(folder: Path, needed: float) -> None:
 
 def simulate_clip(settings: Simulate, clip: Path) -> Path:
     """A video file -> events and its pictures, as one file; returns its name."""
-    path = settings.output
+    path = followed(settings.output)
     if path.suffix not in CLIP_SUFFIXES:
         raise OutputError(f"{path}: with --video the output is one file: name it {path}.h5")
     check_no_pipe(clip, PictureError)

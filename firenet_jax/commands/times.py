@@ -27,7 +27,7 @@ UNIT_NAMES = {names[0]: names[-1] for names in text.UNITS.values()}  # "ms": "mi
 COLUMN = re.compile(r"t|time|timestamps?|stamps?")  # without its unit
 # Of a column, in a header line.
 NAME = re.compile(r"""(?<![\w.:+-])(?!(?:nan|inf)\b)[a-z_][a-z_0-9]*(?:[\s,;:\[("']|$)""")
-NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-zµμ]*)", re.IGNORECASE)
+NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d{1,4000})?)\s*([a-zµμ]*)", re.IGNORECASE)
 SPLIT = re.compile(r"[\s,;]+")
 LARGEST = 1 << 28  # bytes of a file of times
 

@@ -19,6 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
+from firenet_jax.checkpoint import load_weights
+from firenet_jax.evaluation.methods import digest
 from firenet_jax.evaluation.results import METRICS
 from firenet_jax.events import Events
 
@@ -202,7 +204,8 @@ def page(results: dict, shown: dict[str, Shown]) -> str:
         for kind, means in results["means"].items():
             table_of = _table(results, means, colours, f"Mean {kind}")
             parts.append(f"<div class=wide>{table_of}</div>")
-    said = [*(f"{name}: {about(name)}" for name in results["methods"]), *notes(results)]
+    said = [f"{name}: {about(name, record)}" for name, record in results["methods"].items()]
+    said += notes(results)
     parts.append("<ul>" + "".join(f"<li>{escape(note)}</li>" for note in said) + "</ul>")
     links = (f'<a href="#{_anchor(k)}">{escape(name)}</a>' for k, name in enumerate(sequences))
     parts.append(f"<nav>{''.join(links)}</nav>")
@@ -219,17 +222,20 @@ def page(results: dict, shown: dict[str, Shown]) -> str:
     return "\n".join(part for part in parts if part)
 
 
-def about(method: str) -> str:
-    """What a method is, for people who read its name in a table."""
+def about(name: str, record: dict | None) -> str:
+    """What a method is, for people who read its name in a table. Names of weights may be any."""
+    kind = name if record is None else record["method"]
+    if record is not None and kind == "firenet":
+        ours = record["weights"] == digest(load_weights())
+        whose = "the weights of this package" if ours else "with the weights of this name"
+        return f"FireNet (Scheerlinck et al. 2020), {whose}"
     known = {
         "hf": "high-pass filter (Scheerlinck et al. 2018), not learned",
         "mr": "manifold regularisation (Reinbacher et al. 2016), not learned",
         "e2vid": "E2VID (Rebecq et al. 2019), from its checkpoint",
         "e2vid-random": "E2VID with random weights: its images mean nothing",
-        "firenet": "FireNet (Scheerlinck et al. 2020), the weights of this package",
-        "built-in": "FireNet (Scheerlinck et al. 2020), the weights of this package",
     }
-    return known.get(method, "FireNet (Scheerlinck et al. 2020) with the weights of this name")
+    return known[name if name == "e2vid-random" else kind]
 
 
 def made(results: dict) -> str:

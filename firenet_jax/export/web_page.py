@@ -8,6 +8,7 @@
 Any server of static files shows it; nothing leaves the machine that looks at it.
 """
 
+import contextlib
 import importlib.resources
 import json
 import shutil
@@ -20,7 +21,7 @@ import numpy as np
 from firenet_jax.events import Events
 from firenet_jax.export.onnx_model import onnx_model
 from firenet_jax.network import Weights
-from firenet_jax.storage.files import OutputError, named, writing
+from firenet_jax.storage.files import OutputError, writing
 
 RUNTIME = "onnxruntime-web"
 # Both ways to run: on a GPU, and where there is none.
@@ -55,21 +56,28 @@ def write_page(folder: Path, weights: Weights, sample: Events, height: int, widt
     """Writes the folder. Raises OutputError where onnx or the runtime is missing, or no room."""
     runtime_version(runtime)
     model = onnx_model(weights, picture=True).SerializeToString()
-    final = named(folder)
-    with writing(folder):
-        final.parent.mkdir(parents=True, exist_ok=True)
-    prefix = f"{final.name}.partial."
-    with writing(folder), TemporaryDirectory(prefix=prefix, dir=final.parent) as made:
-        beside = Path(made)
-        (beside / "ort").mkdir()
-        for page in importlib.resources.files("firenet_jax.export").joinpath("page").iterdir():
-            (beside / page.name).write_bytes(page.read_bytes())
-        (beside / "firenet.onnx").write_bytes(model)
-        columns: dict[str, Any] = {"t": sample.t, "x": sample.x, "y": sample.y, "p": sample.p}
-        np.savez_compressed(beside / "sample.npz", **columns, width=width, height=height)
-        for name in FILES:
-            shutil.copyfile(runtime / "dist" / name, beside / "ort" / name)
-        for path in [path for path in beside.rglob("*") if path.is_file()]:
-            place = folder / path.relative_to(beside)  # what else lies in the folder stays
-            place.parent.mkdir(parents=True, exist_ok=True)
-            path.replace(place)
+    try:
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            # Made within it, as it may be on a disk of its own.
+            with TemporaryDirectory(prefix=".partial.", dir=folder) as made:
+                _write_files(Path(made), model, sample, height, width, runtime)
+                for path in [path for path in Path(made).rglob("*") if path.is_file()]:
+                    place = folder / path.relative_to(made)  # what else lies in the folder stays
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    path.replace(place)
+    except BaseException:
+        with contextlib.suppress(OSError):  # something lies in it
+            folder.rmdir()
+        raise
+
+
+def _write_files(folder: Path, model: bytes, sample: Events, height: int, width: int, runtime):
+    (folder / "ort").mkdir()
+    for page in importlib.resources.files("firenet_jax.export").joinpath("page").iterdir():
+        (folder / page.name).write_bytes(page.read_bytes())
+    (folder / "firenet.onnx").write_bytes(model)
+    columns: dict[str, Any] = {"t": sample.t, "x": sample.x, "y": sample.y, "p": sample.p}
+    np.savez_compressed(folder / "sample.npz", **columns, width=width, height=height)
+    for name in FILES:
+        shutil.copyfile(runtime / "dist" / name, folder / "ort" / name)

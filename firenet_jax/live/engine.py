@@ -76,21 +76,27 @@ def sound(
 ) -> Iterator[Events]:
     """Passes on what can be events of this sensor, in order of time; counts the rest.
 
-    After an event of a wrong, late time those that follow count as back in time, until there are
-    so many that the sender's clock must have been set. Raises RecordingError where most of the
+    Of times that are not in order those are left out of which there are fewer: wrong, late ones, or
+    what follows them. Where one is the last to arrive at once, what follows counts as back in time,
+    until there is so much that the sender's clock must have been set. Raises RecordingError where most of the
     first thousand are outside the sensor.
     """
     last, shift, behind = None, 0, 0
     for events in arrivals:
         if len(events):
             last = int(events.t[0]) if last is None else last
-            behind = behind + len(events) if int(events.t.max()) + shift < last else 0
+            back = int((events.t + shift < last).sum())  # a wrong one may be among them again
+            behind = behind + back if 2 * back > len(events) else 0
             if behind >= BAD_AFTER:  # the sender's clock was set: its times go on from the last one
                 shift, behind = last + 1 - int(events.t[0]), 0
             events = replace(events, t=events.t + shift) if shift else events
             latest = np.maximum.accumulate(np.maximum(events.t, last))
             inside = (events.x >= 0) & (events.y >= 0) & (events.x < width) & (events.y < height)
-            good = inside & (events.t >= latest)
+            good = events.t >= latest
+            ahead = events.t > np.minimum.accumulate(events.t[::-1])[::-1]
+            if ahead.sum() < len(good) - good.sum():  # few are wrong, not all that follow them
+                good = ~ahead & (events.t >= last)
+            good &= inside
             figures.events += len(events)
             if not good.all():
                 figures.bad += int(len(good) - good.sum())

@@ -74,7 +74,7 @@ class Board:
     def __init__(self):
         self.changed = threading.Condition()
         self.picture = np.zeros((1, 1, 3), np.uint8)  # until there is one
-        self.number, self.jpeg, self.ended = 0, (0, b""), False
+        self.number, self.jpeg, self.ended = 0, (-1, b""), False
 
     def hang(self, picture: np.ndarray) -> None:
         """(H, W, 3) uint8"""

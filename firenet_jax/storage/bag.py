@@ -24,7 +24,7 @@ from firenet_jax.storage.files import lock, locked, partial_name, writing
 IMAGE, HEADER, TIME = (
     "sensor_msgs/msg/Image", "std_msgs/msg/Header", "builtin_interfaces/msg/Time",
 )  # fmt: skip
-TOPIC = re.compile(r"/?[A-Za-z~][\w~]*(/[A-Za-z~][\w~]*)*")  # what ROS allows
+TOPIC = re.compile(r"(~|~?/)?[A-Za-z]\w*(/[A-Za-z]\w*)*", re.ASCII)  # what ROS allows
 OURS = re.compile(r"metadata\.yaml(\.tmp)?|.*\.db3(-journal|-wal|-shm)?")  # in a ROS 2 bag
 
 

@@ -32,7 +32,7 @@ class _Lines(tqdm):
 
     def close(self) -> None:
         """Without tqdm's last line: commands print their own."""
-        if not self.disable:
+        if not getattr(self, "disable", True):  # not there if it was interrupted early
             self.disable = True
             self._decr_instances(self)  # pyright: ignore[reportAttributeAccessIssue]
 

@@ -97,10 +97,10 @@ def identify(
         anchors = " or ".join(f"{first} ({title})" for title, first in firsts.items())
         raise CheckpointError(
             f"{path} holds no {kind}: expected {anchors}, found {len(tensors)} other names, "
-            f"the first {next(iter(tensors))!a}; {advice}"
+            f"the first '{_shown(next(iter(tensors)))}'; {advice}"
         )
     if len(found) > 1:
-        prefixes = ", ".join(repr(prefix) for _, prefix in found)
+        prefixes = ", ".join(f"'{_shown(prefix)}'" for _, prefix in found)
         raise CheckpointError(f"{path} holds several networks ({prefixes}); save one of them alone")
     return found[0]
 

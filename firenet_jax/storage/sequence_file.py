@@ -132,8 +132,8 @@ def _write_events(file, events: Iterable[Events], times: np.ndarray) -> tuple[in
         before += np.searchsorted(part.t, times)
         count, on = rows.stop, on + int(part.p.sum())
         first, last = int(part.t[0]) if first is None else first, int(part.t[-1])
-    for image, index in zip(file["images"].values(), before, strict=True):
-        image.attrs["event_idx"] = index
+    for number, index in enumerate(before):  # `values()` would keep something of each open
+        file[f"images/image{number:09d}"].attrs["event_idx"] = index
     start, end = (first or 0) / 1e6, (last or 0) / 1e6
     facts = {"num_events": count, "num_pos": on, "num_neg": count - on}
     return count, facts | {"t0": start, "tk": end, "duration": end - start}
