@@ -408,6 +408,8 @@ def write_all(settings: Evaluate, results: dict, plans: dict[str, Plan], done: l
     results["command"] = options.command_line("evaluate", settings)
     write_text(folder / "results.json", json.dumps(results, indent=1, allow_nan=False))
     write_text(folder / "table.csv", report.spreadsheet(results))
+    for name in results["sequences"]:  # a video may be of other settings
+        (folder / "videos" / f"{name}.mp4").unlink(missing_ok=True)
     shown = {name: show(settings, plan, done) for name, plan in plans.items()}
     write_text(folder / "index.html", report.page(results, shown))
     print(report.table(results))
@@ -450,9 +452,9 @@ def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
         for number, images in side_by_side("stills")
     ]
     clip = list(side_by_side("clip"))
-    video, path = None, settings.output / "videos" / f"{plan.name}.mp4"
-    path.unlink(missing_ok=True)  # it may be of other settings
+    video = None
     if len(clip) > 1:
+        path = settings.output / "videos" / f"{plan.name}.mp4"
         path.parent.mkdir(exist_ok=True)
         step = np.median(np.diff([int(times[number]) for number, _ in clip])) / 1e6
         coarser = -(-len(clip[0][1]) * plan.recording.width // MAX_VIDEO_WIDTH)

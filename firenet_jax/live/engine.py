@@ -78,8 +78,8 @@ def sound(
 
     Of times that are not in order those are left out of which there are fewer: wrong, late ones, or
     what follows them. Where one is the last to arrive at once, what follows counts as back in time,
-    until there is so much that the sender's clock must have been set. Raises RecordingError where most of the
-    first thousand are outside the sensor.
+    until there is so much that the sender's clock must have been set. Raises RecordingError where
+    most of the first thousand are outside the sensor.
     """
     last, shift, behind = None, 0, 0
     for events in arrivals:
