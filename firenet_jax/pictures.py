@@ -120,17 +120,18 @@ def display(
     `automatic_range`, or of clip(min, 0, 0.45) and clip(max, 0.55, 1). Where the range is fixed the
     state is not used.
     valid: (T, B) bool; images that are not valid leave the state as it was. None: all are.
-    Raises ValueError for images of another shape, or a state of another number of recordings.
+    Raises ValueError for images of another shape, or a state of another number of recordings, where
+    the range is not fixed.
     """
+    if settings.unsharp:
+        images = unsharp_mask(images, settings.unsharp)
+    if settings.range == "fixed":
+        return state, _to_8_bit(images, settings.bilateral)
     if images.ndim != 4 or len(state.low) != images.shape[1]:
         raise ValueError(
             f"images of shape {images.shape} and the state of {len(state.low)} recordings: "
             "expected (T, B, H, W), and a state of B"
         )
-    if settings.unsharp:
-        images = unsharp_mask(images, settings.unsharp)
-    if settings.range == "fixed":
-        return state, _to_8_bit(images, settings.bilateral)
     if valid is None:
         valid = jnp.ones(images.shape[:2], bool)
     if settings.range == "auto":
