@@ -700,6 +700,8 @@ def test_wrong_times_now_and_then_do_not_stop_all():
     found = concatenate([*sound(chunks, 12, 20, figures)])
     assert (figures.events, figures.bad, len(found)) == (6010, 10, 6000)
     assert (np.diff(found.t) >= 0).all() and found.t[-1] < 600_000
+    first = concatenate([wrong, chunks[0]])  # nor does the very first
+    assert len(concatenate([*sound([first, *chunks[1:]], 12, 20, Figures())])) == 6000
     # The last of a chunk cannot be told from a pause: a thousand events later it goes on from it.
     chunks[100] = concatenate([chunks[100], wrong])
     figures = Figures()

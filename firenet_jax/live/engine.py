@@ -84,7 +84,7 @@ def sound(
     last, shift, behind = None, 0, 0
     for events in arrivals:
         if len(events):
-            last = int(events.t[0]) if last is None else last
+            last = int(events.t.min()) if last is None else last
             back = int((events.t + shift < last).sum())  # a wrong one may be among them again
             behind = behind + back if 2 * back > len(events) else 0
             if behind >= BAD_AFTER:  # the sender's clock was set: its times go on from the last one
