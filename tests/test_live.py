@@ -671,6 +671,13 @@ def test_it_ends_after_so_many_seconds(tmp_path, monkeypatch, capsys):
     assert time.monotonic() - begun < 25 and "events in" in capsys.readouterr().out
 
 
+def test_what_was_taken_in_time_is_seen(monkeypatch):
+    """Although it was read for longer than all may take."""
+    clock = itertools.count()
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock))
+    assert [len(part) for part in live._first(0.5, iter([some_events(7), some_events(9)]))] == [7]
+
+
 def test_seconds_count_from_the_first_look_at_the_source(tmp_path, monkeypatch, capsys):
     """On a busy machine compiling took them all, and none were left for events."""
     monkeypatch.chdir(tmp_path)

@@ -201,9 +201,9 @@ def _first(seconds: float, arrivals: Iterator[Events]) -> Iterator[Events]:
     """What comes in so long, from when it is asked for: what is compiled before does not count."""
     begun = time.monotonic()
     for events in arrivals:
+        yield events  # those too that were taken in time, but read after it
         if time.monotonic() - begun >= seconds:
             return
-        yield events
 
 
 def _say(figures: Figures) -> None:

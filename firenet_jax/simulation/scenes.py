@@ -153,6 +153,7 @@ class Scene(NamedTuple):
     softness: jax.Array  # (K,) pixels over which the edge fades
     pauses: jax.Array  # (PAUSES, 3) seconds: start, end, and how long stopping takes
     speed: jax.Array  # () pixels per second; no point of the picture moves faster
+    # at the times of `_at_speed`; between them, in scenes of a minute, by up to an eighth
 
 
 class Rendering(NamedTuple):
@@ -413,7 +414,8 @@ def _at_speed(scene: Scene, speed, duration, height: int, width: int) -> Scene:
 
     A faster pace sees more of the path, and so perhaps a faster part of it: hence the rounds.
     The speed is measured at 128 times, or at 1,024 of a camera that trembles; 5 % cover what
-    happens between them.
+    happens between them in a few seconds. (Renderings are as dense as motion wants in any scene:
+    `rendering_times` measures for itself.)
     """
     times = duration * jnp.linspace(0.0, 1.0, 128 if scene.shake is None else 1024)
 
