@@ -1170,6 +1170,7 @@ READY = replace(EAGER, steps=1600, motion=(2.0, 40.0), seed=1012,
                 sensor=replace(FINE.sensor, clean=0.35))  # fmt: skip
 FAITHFUL = replace(READY, steps=701, motion=(0.5, 40.0), learning_rate=1e-3, seed=1032)
 FINER = Holding(turning=4, turns=(6, 90), alike=4.0, faint=0.01, cut=48)
+MORE_HELD = FINER._replace(hold=4.0, alike=6.0, cut=64)
 READIES = mixed((CONSTANTS, 4), ({"eager": 1, "ready": 1}, 6))
 HOLDING = {  # the mean that each begins from, its settings, how it holds
     "loyal": ({"rested": 1}, LOYAL, Holding()),
@@ -1179,7 +1180,7 @@ HOLDING = {  # the mean that each begins from, its settings, how it holds
     "constant": (SWIFTEST, CONSTANT, Holding(turning=4, turns=(6, 90), alike=4.0, faint=0.02)),
     "eager": (CONSTANTS, EAGER, FINER),
     "ready": (CONSTANTS, READY, FINER),
-    "faithful": (READIES, FAITHFUL, FINER._replace(hold=4.0, alike=6.0, cut=64)),
+    "faithful": (READIES, FAITHFUL, MORE_HELD),
 }
 # Less of CONSTANTS has more contrast, and remembers less: with half, slider_depth comes back from
 # forty rounds at .949. "ready" beside "eager" rests less well.
@@ -1196,7 +1197,7 @@ PLACID = replace(
     loss=replace(FAITHFUL.loss, l1=3.0, lambda_tc=6.0),
     sensor=replace(FINE.sensor, clean=0.3),
 )
-NEXT = {"placid": (LAST_MEAN, PLACID, FINER._replace(hold=4.0, alike=6.0, cut=64))}
+NEXT = {"placid": (LAST_MEAN, PLACID, MORE_HELD)}
 # The candidate of the second ConvGRU has this share of that of DUSKY, which "vast" began from; the
 # rest is, up to "rapid", that of "vast", and later of the mean itself. More of it remembers better
 # what goes to and fro, and rests less well. FORMER had half.

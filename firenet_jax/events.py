@@ -54,12 +54,12 @@ class Events:
         microseconds and the coordinates whole numbers that int16 holds. `recording` and the readers
         also check that events lie on the sensor, and in order of time."""
         t, x, y, p = map(np.asarray, (t, x, y, p))
-        if not t.shape == x.shape == y.shape == p.shape or t.ndim != 1:
+        if not t.shape == x.shape == y.shape == p.shape:
             raise ValueError(
                 f"columns differ in length: t {t.shape}, x {x.shape}, y {y.shape}, p {p.shape}"
-                if t.ndim == 1
-                else f"columns are of shape (N,), not {t.shape}"
             )
+        if t.ndim != 1:
+            raise ValueError(f"columns are of shape (N,), not {t.shape}")
         if t.dtype.kind == "f" and not (np.isfinite(t) & (t == np.rint(t))).all():
             raise ValueError("times must be whole microseconds: round 1e6 times seconds")
         return cls(

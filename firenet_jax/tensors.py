@@ -70,9 +70,9 @@ def pack(
     size: padded length, at least the number of events; None: `capacity` of that number.
     bounds: (T, B, 2) int64 microseconds, t_min and t_max of each window; None: its least and
     greatest time.
-    Raises ValueError if rows are missing or of unequal length, if columns have not the dtypes of
-    `Events`, if bounds are of another shape, not whole or end before they begin, if the events do
-    not fit into `size`, or if there are 2^15 windows or more.
+    Raises ValueError if rows are missing or of unequal length, if columns are of another kind than
+    those of `Events`, if bounds are of another shape, not whole or end before they begin, if the
+    events do not fit into `size`, or if there are 2^15 windows or more.
     """
     if not windows or not windows[0] or {len(row) for row in windows} != {len(windows[0])}:
         raise ValueError("windows are T rows of B windows each, T and B at least 1")
