@@ -118,8 +118,10 @@ def load_weights(path: str | Path | None = None) -> Weights:
 def _load_npz(path: Path) -> Weights:
     try:
         # A damaged or hostile file may claim any size: check the archive before reading it.
-        with zipfile.ZipFile(path) as archive:
-            size = sum(info.file_size for info in archive.infolist())
+        size = path.stat().st_size
+        if size <= 2 * MAX_BYTES:  # with its directory, which is read whole
+            with zipfile.ZipFile(path) as archive:
+                size = sum(info.file_size for info in archive.infolist())
         if size > MAX_BYTES:
             raise CheckpointError(f"{path} holds {size} bytes and is not a FireNet (157 kB); {TRY}")
         with np.load(path, allow_pickle=False) as file:

@@ -169,6 +169,15 @@ def test_wrong_npz(tmp_path, weights, changes, message):
         load_weights(path)
 
 
+def test_an_archive_of_very_many_members_is_not_read(tmp_path, monkeypatch):
+    with zipfile.ZipFile(tmp_path / "w.npz", "w") as archive:
+        for number in range(30_000):
+            archive.writestr(f"{number}.npy", b"")
+    monkeypatch.setattr(zipfile, "ZipFile", None)
+    with pytest.raises(CheckpointError, match="holds .* bytes and is not a FireNet"):
+        load_weights(tmp_path / "w.npz")
+
+
 @pytest.mark.parametrize("beyond, message", [(0, "no place for 'more'"), (1, "holds 1048577 byt")])
 def test_a_mebibyte_is_read_and_no_more(tmp_path, weights, beyond, message):
     path = tmp_path / "w.npz"

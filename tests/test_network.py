@@ -229,7 +229,7 @@ def test_weights_are_told_apart_by_identity():
 
 
 @pytest.mark.parametrize("machine_code", [True, False])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("value", [np.nan, np.uint32(0xFFFFFFFF).view(np.float32), np.inf], ids=str)
 def test_what_is_not_finite_is_not_taken_for_an_empty_window(value, machine_code):
     params, tensors = random_run(steps=2, batch=1, height=9, width=10)
     tensors = jnp.asarray(tensors).at[0, 0, 4, 4, 2].set(value)

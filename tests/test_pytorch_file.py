@@ -401,6 +401,14 @@ def test_damaged_files(file, content, message):
         read_state_dict(file(content))
 
 
+def test_a_file_that_is_far_too_large_is_not_read(tmp_path):
+    with (tmp_path / "w.pth").open("wb") as sparse:
+        sparse.write(b"\x80\x02")
+        sparse.truncate(2**31)
+    with pytest.raises(CheckpointError, match="w.pth holds 2147483648 bytes"):
+        read_state_dict(tmp_path / "w.pth")
+
+
 def test_other_zip(tmp_path):
     with zipfile.ZipFile(tmp_path / "events.zip", "w") as archive:
         archive.writestr("events.txt", "240 180\n")

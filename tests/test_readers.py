@@ -286,6 +286,15 @@ def test_text_in_the_unit_that_its_names_tell(tmp_path, caplog, name, unit, whol
     assert "read as microseconds" not in caplog.text
 
 
+@pytest.mark.parametrize("word", ["hello", "1.2.3", "nan.", "xe"])
+def test_a_bad_row_says_nothing_of_the_unit_of_the_others(tmp_path, word):
+    rows = [f"{50 * i} {i % 64} {i % 48} {i % 2}" for i in range(2000)]
+    rows[500] = f"{word} {word} 4 1"
+    path = write(tmp_path / "a.txt", "64 48\n" + "\n".join(rows))
+    expected = np.delete(50 * np.arange(2000), 500)
+    np.testing.assert_array_equal(events_of(path, None).t, expected)
+
+
 @pytest.mark.parametrize("block", [64, 1 << 21])
 @pytest.mark.parametrize(
     "off, on", [("False", "True"), ("false", "true"), ("-1", "+1"), ("0", "+1")]

@@ -127,6 +127,8 @@ def test_four_devices_and_two_processes_learn_what_one_device_learns(tmp_path):
             assert other["loss"] == pytest.approx(entry["loss"], rel=1e-5), entry
             if entry["kind"] == "train":  # Adam would not tell a gradient from a multiple of it
                 assert other["gradient"] == pytest.approx(entry["gradient"], rel=1e-2), entry
+            # Of sequences with other numbers of images that count, too.
+            assert other["temporal"] == pytest.approx(entry["temporal"], rel=1e-3), entry
     for name in ("one", "four", "two"):
         assert (tmp_path / name / "weights.npz").exists()
 
@@ -456,6 +458,7 @@ def test_a_short_run_warms_up_in_fewer_steps(tmp_path):
     assert train_settings.warming_up(Train(tmp_path)) == 200
     assert train_settings.warming_up(Train(tmp_path, steps=1)) == 0
     assert train_settings.warming_up(Train(tmp_path, steps=30, warmup=20)) == 20
+    assert train_settings.warming_up(Train(tmp_path, steps=300, warmup=200)) == 200
 
 
 @pytest.fixture
@@ -650,3 +653,26 @@ def test_a_run_that_goes_on_keeps_weights_that_did_better_before(tmp_path, monke
         kept.append(load_weights(tmp_path).params["head"]["bias"][0])
     assert kept == [3, 3, 6]
     assert load_weights(tmp_path / "last.npz").params["head"]["bias"][0] == 6
+
+
+@pytest.mark.slow
+def test_a_run_whose_best_weights_are_gone_says_so_and_keeps_new_ones(tmp_path, capsys):
+    run(tiny(tmp_path, steps=2, validate_every=1))
+    (tmp_path / "weights.npz").unlink()
+    run(tiny(tmp_path, steps=2, validate_every=1))
+    assert "the best, weights.npz, is gone" in capsys.readouterr().out
+    run(tiny(tmp_path, steps=3, validate_every=1))
+    assert f"{tmp_path / 'weights.npz'}: best" in capsys.readouterr().out
+    assert load_weights(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_run_of_before_the_warm_up_had_no_default_goes_on(tmp_path):
+    run(tiny(tmp_path, steps=3, warmup=None), stop=1)
+    path = tmp_path / "settings.json"
+    record = json.loads(path.read_text())
+    assert record["warmup"] is None
+    path.write_text(json.dumps(record | {"warmup": 200}))
+    run(tiny(tmp_path, steps=3, warmup=None))
+    with pytest.raises(ValueError, match="warmup was None, now 1"):
+        run(tiny(tmp_path, steps=3, warmup=1))

@@ -240,8 +240,8 @@ class Function:
         return self.max(x, vector(0))
 
     def exp(self, x):
-        """2^n e^r, r between half of -ln 2 and of ln 2."""
-        x = self.max(x, vector(-87))
+        """2^n e^r, r between half of -ln 2 and of ln 2. What is not a number stays so."""
+        given, x = x, self.max(x, vector(-87))
         x = self.b.select(self.b.fcmp_ordered(">", x, vector(88)), vector(88), x)
         # Added to a number this large, a fraction is rounded away; n is in the last bits.
         large = vector(1.5 * 2**23)
@@ -252,7 +252,9 @@ class Function:
             series = self.fma(series, r, vector(term))
         series = self.fma(self.b.fmul(series, r), r, self.b.fadd(r, vector(1)))
         exponent = self.b.shl(self.b.bitcast(shifted, INTS), ir.Constant(INTS, [23] * LANES))
-        return self.b.bitcast(self.b.add(self.b.bitcast(series, INTS), exponent), VECTOR)
+        result = self.b.bitcast(self.b.add(self.b.bitcast(series, INTS), exponent), VECTOR)
+        # Added to the last bits of NaN, the exponent may make a number of it.
+        return self.b.select(self.b.fcmp_unordered("uno", given, given), given, result)
 
     def sigmoid(self, x):
         """1 / (1 + e^-x). "arcp": by an estimate and a Newton step, a division takes longer."""

@@ -168,7 +168,10 @@ def _sniff(path: Path, member: str | None, columns: str | None = None) -> Layout
         )
 
     found = {name: [row[i] for row in rows if i < len(row)] for i, name in enumerate(names)}
-    whole = {name: not any(set(".e") & set(word.lower()) for word in found[name]) for name in NAMES}
+    whole = {  # a word that is no number makes its row a bad one, and tells nothing
+        name: not any(set(".e") & set(word.lower()) for word in filter(_is_number, found[name]))
+        for name in NAMES
+    }
     types = {name: pa.int32() if whole[name] else pa.float64() for name in "xyp"}
     polarity = names.index("p")
     if any(row[polarity] in LOGICAL for row in rows[:1] if polarity < len(row)):

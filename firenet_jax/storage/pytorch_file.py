@@ -19,6 +19,7 @@ counted in elements.
 
 import io
 import math
+import os
 import pickletools
 import struct
 import zipfile
@@ -34,6 +35,7 @@ from firenet_jax.storage.files import check_readable
 
 MAGIC_NUMBER = 0x1950A86A20F9469CFC6C
 PROTOCOL = 1001
+MAX_BYTES = 2**30  # of the old format, which is read whole
 MAX_ELEMENTS = 2**28  # 100 times the largest network of this field; a stride of 0 can claim any
 MAX_DIMENSIONS = 64  # numpy's
 MAX_KEY = 16  # items of a tuple that is a key: it is hashed anew each time
@@ -55,7 +57,13 @@ def read_state_dict(path: str | Path) -> dict[str, np.ndarray]:
     try:
         with open(path, "rb") as file:
             start = file.read(16)
-            content = start + file.read() if start[:1] == b"\x80" else b""
+            old = start[:1] == b"\x80"
+            if old and (size := os.fstat(file.fileno()).st_size) > MAX_BYTES:
+                raise CheckpointError(
+                    f"{path} holds {size} bytes and is no network of this field; {AGAIN}"
+                )
+            file.seek(0)
+            content = file.read() if old else b""
     except OSError as error:
         raise CheckpointError(
             f"{path} cannot be read ({error.strerror or error}); check the path"

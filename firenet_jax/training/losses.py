@@ -10,6 +10,7 @@ weighted sum of distances that need none, by default about as large as LPIPS of 
 reconstruction (0.4 to 0.5), so that lambda_TC has the same meaning.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
@@ -103,6 +104,7 @@ def sequence_loss(
     visible: jax.Array,
     settings: Loss = Loss(),
     warm: jax.Array | bool = False,
+    mean: Callable[[jax.Array], jax.Array] = lambda each: each,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Eq. 2 for T images in time order, T at most L + 1 -> (loss, its terms).
 
@@ -111,6 +113,7 @@ def sequence_loss(
     visible: (T, B, H, W) bool, False where image k shows what image k-1 did not.
     Only `detail` uses displacements[0] and visible[0], as image 0 has no predecessor here.
     warm: () or (B,) bool, whether the state was warm before image 0, so that l0 does not apply.
+    mean: of a number over the devices that share the sequences. What is returned is of this one.
 
     loss: scalar. Terms: scalars, unweighted means over batch and images (for "temporal" over those
     that count), so that different lengths are comparable; "reconstruction" is the mean of L_R:
@@ -151,5 +154,5 @@ def sequence_loss(
             counted = jnp.where(warm, True, jnp.broadcast_to(late, errors.shape)).astype(float)
         total = (counted * errors).sum(0).mean()
         loss += settings.lambda_tc * total
-        terms["temporal"] = total / jnp.maximum(counted.sum(0).mean(), 1)
+        terms["temporal"] = total / jnp.maximum(mean(counted.sum(0).mean()), 1)
     return loss, {name: term.mean() for name, term in terms.items()}

@@ -15,6 +15,7 @@ equals an uninterrupted one. A run is a folder:
 import contextlib
 import hashlib
 import itertools
+import math
 import signal
 import threading
 import time
@@ -86,7 +87,7 @@ def run(
         sources, validation = sources_of(settings, done)
         _keep_settings(folder, settings)  # only now, so that a failed start leaves no run behind
         log = Log(folder, done)
-        best, last_save = log.best(), time.monotonic()
+        best, last_save = log.best() if _best(folder).exists() else math.inf, time.monotonic()
         last = min(settings.steps, stop or settings.steps)
         with (
             contextlib.closing(log),
@@ -112,7 +113,14 @@ def run(
     if interrupted:
         raise KeyboardInterrupt(f"step {done} is saved: the same command goes on from there")
     if is_first():
-        print(f"{folder / 'weights.npz'}: best validation loss {best:.4f} in {done} steps")
+        if _best(folder).exists():
+            print(f"{_best(folder)}: best validation loss {best:.4f} in {done} steps")
+        else:
+            print(f"{folder / 'last.npz'}: after {done} steps; the best, weights.npz, is gone")
+
+
+def _best(folder: Path) -> Path:
+    return folder / "weights.npz"
 
 
 def _say_how_far(folder: Path, done: int, steps: int) -> None:
@@ -302,6 +310,8 @@ def _check_settings(folder: Path, settings: Train) -> None:
     now = _record(settings)
     if found.get("files") is None:  # a run of before it was kept
         found["files"] = now["files"]
+    if found.get("warmup") == 200 and settings.warmup is None:  # of before the default was None
+        found["warmup"] = None
     found = runs.completed(found, _record(Train(folder)))
     done = (folder / "checkpoints" / str(found["steps"])).is_dir()
     longer = isinstance(found["steps"], int) and found["steps"] < settings.steps

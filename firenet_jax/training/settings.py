@@ -87,8 +87,8 @@ class Train:
     what it has seen. Needs an even number of windows."""
     learning_rate: float = 1e-3
     """Peak learning rate, after the warm-up; it then decays to a hundredth along a cosine."""
-    warmup: int = 200
-    """Steps of the linear warm-up. If it is not chosen, at most a fifth of the run."""
+    warmup: int | None = None
+    """Steps of the linear warm-up. Default: 200, at most a fifth of the run."""
     optimiser: Literal["muon", "centred", "adam"] = "muon"
     """muon learns more per step (experiments/compare_optimisers.py); the paper used adam. With
     centred, muon too, no channel dies at a high rate. The learning rate has the same scale for all:
@@ -213,6 +213,5 @@ def _check_step(settings: Train) -> None:
 
 
 def warming_up(settings: Train) -> int:
-    """Steps of the warm-up: as set; the default is at most a fifth of the run."""
-    asked = settings.warmup != Train.warmup
-    return settings.warmup if asked else min(settings.warmup, settings.steps // 5)
+    """Steps of the warm-up."""
+    return min(200, settings.steps // 5) if settings.warmup is None else settings.warmup

@@ -91,8 +91,9 @@ def optimiser(settings: StepSettings) -> optax.GradientTransformation:
 
     Muon (Jordan et al. 2024) orthogonalises the update of a kernel, as a matrix (9 inputs,
     outputs); 0.2 is the usual root mean square of Adam's updates (Liu et al., arXiv 2502.16982).
-    Biases and the 1x1 convolution always use Adam. "centred" is Muon, too, but with gradients and
-    updates of centred inputs (`centring`); its `update` takes their means.
+    With it biases and the 1x1 convolution use Adam with Nesterov's momentum (Dozat 2016), whose first
+    updates are larger than Adam's. "centred" is Muon, too, but with gradients and updates of centred
+    inputs (`centring`); its `update` takes their means.
     """
     rate = optax.warmup_cosine_decay_schedule(
         0.0, settings.learning_rate, settings.warmup, settings.steps, settings.learning_rate / 100
@@ -292,8 +293,9 @@ def loss_of(
     def one_device(params, data, state, warm):
         last, images = images_of(params, data.tensors, settings, state)
         truth = data.images, data.displacement, data.visible
-        losses = sequence_loss(images, *truth, settings.loss, warm)
-        return jax.lax.pmean(losses, "devices"), (last, images)
+        mean = partial(jax.lax.pmean, axis_name="devices")
+        losses = sequence_loss(images, *truth, settings.loss, warm, mean)
+        return mean(losses), (last, images)
 
     # A constant `warm` must stay constant, so it is not an argument of the mapped function.
     known = isinstance(warm, bool)
