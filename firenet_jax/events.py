@@ -60,7 +60,8 @@ class Events:
             )
         if t.ndim != 1:
             raise ValueError(f"columns are of shape (N,), not {t.shape}")
-        if t.dtype.kind == "f" and not (np.isfinite(t) & (t == np.rint(t))).all():
+        whole = t.dtype.kind in "biu" or t.dtype.kind == "f" and bool((t == np.rint(t)).all())
+        if not whole or t.size and max(t.max(), -float(t.min())) >= 2.0**63:
             raise ValueError("times must be whole microseconds: round 1e6 times seconds")
         return cls(
             t.astype(np.int64, copy=False),
@@ -228,7 +229,7 @@ def checked(
             last = held.t[-1] if len(held) else before
             row, rows = rows, rows + len(events)
             if not (isinstance(chunk, Events) and _is_right(events, last, height, width)):
-                first, error = _first_error(chunk, path, last, height, width, place, row)
+                first, worded = _first_error(chunk, path, last, height, width, place, row)
                 bad = _known(chunk) | _outside(events, height, width)
                 wrong, fewest = _fewest(held, events, bad, before)
                 count = int(wrong.sum() + fewest.sum())
@@ -237,8 +238,8 @@ def checked(
                     if first:  # so that a caller who stops before the damage never meets it
                         yield events.select(slice(first))
                     dropped = 0  # the error already says it
-                    raise error
-                first_error, dropped = first_error or error, dropped + count
+                    raise worded()
+                first_error, dropped = first_error or worded(), dropped + count
                 held = held.select(~wrong) if wrong.any() else held
                 events = events.select(~fewest)
             end = max(len(events) - HELD, 0)
@@ -329,31 +330,36 @@ def _out_of_order(t: np.ndarray, bad: np.ndarray, last: int) -> np.ndarray:
 
 def _first_error(
     chunk: "Events | Rows", path: Path, last: int, height, width, place, rows: int
-) -> tuple[int, RecordingError]:
-    """The first bad row of a chunk, and its error; rows: number of rows before the chunk."""
+) -> tuple[int, Callable[[], RecordingError]]:
+    """The first bad row of a chunk, and what words its error, for which `place` may read the file
+    up to there once more; rows: number of rows before the chunk."""
     events = chunk if isinstance(chunk, Events) else chunk.events
     known = _known(chunk)
     t, x, y = events.t, events.x, events.y
     steps = np.diff(t, prepend=last)
     row = int(np.argmax(known | (steps < 0) | _outside(events, height, width)))
-    if isinstance(chunk, Rows) and known[row]:
-        return row, chunk.error
-    where = f"{path}, {place(rows + row)}"
-    if steps[row] < 0:
-        return row, RecordingError(
-            f"{where}: time runs backwards, from {t[row] - steps[row]} to {t[row]} us: "
-            "sort the events by time, or --stop before"
+
+    def worded() -> RecordingError:
+        if isinstance(chunk, Rows) and known[row]:
+            return chunk.error
+        where = f"{path}, {place(rows + row)}"
+        if steps[row] < 0:
+            return RecordingError(
+                f"{where}: time runs backwards, from {t[row] - steps[row]} to {t[row]} us: "
+                "sort the events by time, or --stop before"
+            )
+        name, value = ("y", y[row]) if 0 <= x[row] < (width or np.inf) else ("x", x[row])
+        if value < 0:
+            return RecordingError(
+                f"{where}: {name} is {value}, but coordinates are 0 or more: the file is damaged "
+                "or of another format"
+            )
+        return RecordingError(
+            f"{where}: {name} is {value}, outside the sensor of {width}x{height} pixels: pass the "
+            "right --sensor-size WIDTHxHEIGHT"
         )
-    name, value = ("y", y[row]) if 0 <= x[row] < (width or np.inf) else ("x", x[row])
-    if value < 0:
-        return row, RecordingError(
-            f"{where}: {name} is {value}, but coordinates are 0 or more: the file is damaged "
-            "or of another format"
-        )
-    return row, RecordingError(
-        f"{where}: {name} is {value}, outside the sensor of {width}x{height} pixels: pass the "
-        "right --sensor-size WIDTHxHEIGHT"
-    )
+
+    return row, worded
 
 
 def check_recording(recording) -> None:

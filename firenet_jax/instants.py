@@ -117,12 +117,13 @@ def warming(
     """
     cutter = iter(cutter)
     seen: deque[Window] = deque()
-    damage = None
+    damage, held = None, 0
     most = MOST_WARMING * max(count, WARM_UP) * pixels
     try:
         for window in itertools.islice(cutter, count):
             seen.append(window)
-            if sum(len(window.events) for window in seen) > most:
+            held += len(window.events)
+            if held > most:
                 break
     except RecordingError as error:
         damage = error

@@ -78,9 +78,9 @@ def pack(
         raise ValueError("windows are T rows of B windows each, T and B at least 1")
     shape = len(windows), len(windows[0])
     flat = [window for row in windows for window in row]
-    for name, kind in (("t", "iu"), ("x", "iu"), ("y", "iu"), ("p", "b")):
-        # Seconds would all become one time, and -1 would be true as 1 is.
-        if any(getattr(window, name).dtype.kind not in kind for window in flat):
+    for name, kind in (("t", np.integer), ("x", np.int16), ("y", np.int16), ("p", np.bool_)):
+        # Seconds would become one time, column 2^16 would become 0, and -1 true as 1 is.
+        if not all(np.issubdtype(getattr(window, name).dtype, kind) for window in flat):
             raise ValueError(
                 "events are t int64 whole microseconds, x and y int16, p bool: make them by "
                 f"Events.of ({name} is of another kind)"

@@ -196,19 +196,23 @@ def _by_count(chunks: Iterator[Events], count: int, step: int) -> Iterator[Windo
 def _by_count_or_time(chunks: Iterator[Events], count: int, longest: int) -> Iterator[Window]:
     """Windows of `count` events that last less than `longest` microseconds; a window that would
     last longer has fewer events. None is empty."""
-    held = Events.empty()
-    for chunk in chunks:
-        held, start = concatenate([held, chunk]) if len(held) else chunk, 0
-        while start < len(held):
-            stop = int(np.searchsorted(held.t, held.t[start] + longest))
-            if min(stop, start + count) >= len(held) and stop - start < count:
+    held, size = [], 0  # events of no window yet
+    for chunk in filter(len, chunks):
+        held.append(chunk)
+        size += len(chunk)
+        if size < count and chunk.t[-1] - held[0].t[0] < longest:
+            continue
+        events, start = concatenate(held), 0
+        while start < size:
+            stop = int(np.searchsorted(events.t, events.t[start] + longest))
+            if min(stop, start + count) >= size and stop - start < count:
                 break  # it may go on in the next chunk
             stop = min(stop, start + count)
-            yield _window(held, start, stop)
+            yield _window(events, start, stop)
             start = stop
-        held = held.select(slice(start, None))
-    if len(held):
-        yield _window(held, 0, len(held))
+        held, size = [events.select(slice(start, None))] * (start < size), size - start
+    if size:
+        yield _window(concatenate(held), 0, size)
 
 
 def _by_time(path, chunks: Iterator[Events], begin: int | None, spans) -> Iterator[Window]:

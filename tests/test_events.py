@@ -30,6 +30,9 @@ def test_columns_of_any_kind(p, kind):
 def test_seconds_are_no_times():
     with pytest.raises(ValueError, match="whole microseconds: round 1e6 times seconds"):
         Events.of([0.25, 0.75], [0, 0], [0, 0], [0, 1])
+    for time in (2.0**64, np.uint64(2**64 - 1), np.nan, -np.inf, 1j, "1"):
+        with pytest.raises(ValueError, match="whole microseconds"):
+            Events.of(np.array([time]), [0], [0], [0])
     assert len(Events.of([], [], [], [])) == 0
 
 

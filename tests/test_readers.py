@@ -286,6 +286,26 @@ def test_text_in_the_unit_that_its_names_tell(tmp_path, caplog, name, unit, whol
     assert "read as microseconds" not in caplog.text
 
 
+def test_hexadecimal_is_no_number_wherever_it_is(tmp_path):
+    rows = [f"{1e-4 * i:.4f} 1 2 1" for i in range(3000)]
+    rows[7], rows[9] = "0.0007 0x1 2 1", "0.0009 1 0X2 1"
+    path = write(tmp_path / "a.txt", "\n".join(rows))
+    assert len(events_of(path)) == 2998
+    refused(path, "line 8: x is 0x1, expected a whole number")
+
+
+def test_a_text_is_read_again_for_one_message_only(tmp_path, monkeypatch):
+    """Not for each of its blocks with an event out of order: that takes a time of n squared."""
+    monkeypatch.setattr(text, "BLOCK", 1 << 15)
+    again = []
+    monkeypatch.setattr(text, "_place", lambda *arguments: again.append(1) or "some line")
+    times = np.arange(20_000) / 1e4
+    times[3000::3000] -= 1
+    path = write(tmp_path / "a.txt", "".join(f"{t:.4f} 1 2 1\n" for t in times))
+    assert len(events_of(path)) == 20_000 - 6
+    assert len(again) == 1
+
+
 @pytest.mark.parametrize("word", ["hello", "1.2.3", "nan.", "xe"])
 def test_a_bad_row_says_nothing_of_the_unit_of_the_others(tmp_path, word):
     rows = [f"{50 * i} {i % 64} {i % 48} {i % 2}" for i in range(2000)]
@@ -2099,6 +2119,14 @@ def test_a_file_of_numpy_without_rows(tmp_path, name):
     assert open_recording(tmp_path / name, (240, 320)).count == 0
     with pytest.raises(RecordingError, match="holds no events"):
         open_recording(tmp_path / name)
+
+
+def test_an_order_of_columns_that_is_told_counts_even_where_it_looks_like_another(tmp_path):
+    times, y = 1e-4 * np.arange(50), np.arange(50) % 2
+    np.save(tmp_path / "a.npy", np.stack([times, 3 + np.arange(50) % 7, y, np.ones(50)], 1))
+    refused(tmp_path / "a.npy", "columns look like t,x,p,y")
+    events = next(open_recording(tmp_path / "a.npy", (240, 320), columns="t,x,y,p").events())
+    np.testing.assert_array_equal(events.y, y)
 
 
 def test_wrong_files_of_numpy(tmp_path):

@@ -354,10 +354,10 @@ def test_events_in_any_order_have_the_same_tensor():
 @pytest.mark.parametrize(
     "name, column",
     [("p", np.array([-1, 1])), ("x", np.array([1.0, 2.0])), ("y", np.array([1.0, 2.0])),
-     ("t", np.array([0.1, 0.2]))],
+     ("t", np.array([0.1, 0.2])), ("x", np.array([1, 2**16], np.int32))],
 )  # fmt: skip
 def test_columns_of_another_kind_are_refused(name, column):
-    """-1 would become brighter, and seconds one time."""
+    """-1 would become brighter, seconds one time, and column 2^16 column 0."""
     events = replace(Events.of([0, 5], [1, 2], [3, 4], [0, 1]), **{name: column})
     with pytest.raises(ValueError, match=rf"make them by Events.of \({name} is of another kind"):
         pack([[events]])

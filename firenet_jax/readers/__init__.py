@@ -385,6 +385,7 @@ def reading(path: Path, *errors: type[BaseException]):
         if isinstance(error, PermissionError):
             raise RecordingError(forbidden(error.filename or path)) from error
         found = " ".join(str(error).split()) or type(error).__name__
+        found = found if len(found) <= 200 else f"{found[:197]}..."  # zipfile quotes what it read
         raise RecordingError(
             f"{path}: cannot be read ({found}): the file is damaged, incomplete or of another "
             "format: copy or download it again"

@@ -1,6 +1,5 @@
 """Arrays in memory -> Recording, with the same checks as a file; errors name the array."""
 
-import math
 from numbers import Real
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from firenet_jax.errors import RecordingError, logger
 from firenet_jax.events import MAX_TIME, Recording, checked
 from firenet_jax.readers import in_chunks
 from firenet_jax.readers.text import NAMES, warn_of_whole_seconds
+from firenet_jax.settings import LONGEST_SIDE
 
 UNITS = {"s": None, "ms": 1000, "us": 1}  # in microseconds; seconds become float64
 
@@ -45,8 +45,10 @@ def recording(
     if not columns["t"].size:
         raise RecordingError(f"{name}: holds no events")
     for side, value in (("width", width), ("height", height)):
-        if not (isinstance(value, Real) and 1 <= value < math.inf and int(value) == value):
-            raise RecordingError(f"{name}: {side} is {value}, but is a number of pixels")
+        if not (isinstance(value, Real) and 1 <= value <= LONGEST_SIDE and int(value) == value):
+            raise RecordingError(
+                f"{name}: {side} is {value!r}, but is a number of pixels, at most {LONGEST_SIDE}"
+            )
     if unit not in (None, *UNITS):
         raise RecordingError(f"{name}: unit is {unit!r}, expected one of {', '.join(UNITS)}")
     columns["t"] = _in_unit(name, columns["t"], unit)

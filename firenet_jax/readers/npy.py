@@ -47,7 +47,7 @@ def read(path: Path, columns: str | None = None) -> Source:
     """columns: the order of those of an (N, 4) array, such as "x,y,p,t"."""
     layout = _layout(path)
     if layout is None:
-        order = "txyp" if columns is None else "".join(_order(path, columns))
+        order = None if columns is None else _order(path, columns)
         t, *_ = _of_one_file(path, order)
         text.warn_of_whole_seconds(path, t, "store them as integers: a structured array, or .npz")
         return Source(
@@ -101,8 +101,8 @@ def _order(path: Path, columns: str) -> list[str]:
     return named
 
 
-def _of_one_file(path: Path, order: str) -> list[np.ndarray]:
-    """-> t, x, y, p"""
+def _of_one_file(path: Path, order: list[str] | None) -> list[np.ndarray]:
+    """-> t, x, y, p; order: of the columns of an (N, 4) array, if it was told."""
     if path.suffix.lower() == ".npz":
         with reading(path, Exception), zipfile.ZipFile(path) as archive:
             if sum(info.file_size for info in archive.infolist()) > NPZ:
@@ -122,11 +122,11 @@ def _of_one_file(path: Path, order: str) -> list[np.ndarray]:
             f"{path}: holds {array.dtype} of shape {array.shape}, expected rows (N, 4) of t, x, y, "
             "p or fields of these names"
         )
-    if order == "txyp" and (other := text.other_order(array[: text.SNIFFED].T)):
+    if order is None and (other := text.other_order(array[: text.SNIFFED].T)):
         raise RecordingError(
             f"{path}: its columns look like {other}, not t,x,y,p: pass --columns {other}"
         )
-    return [array[:, order.index(name)] for name in "txyp"]
+    return [array[:, (order or list("txyp")).index(name)] for name in "txyp"]
 
 
 def _sides(path: Path) -> tuple[int, int] | None:

@@ -309,10 +309,14 @@ def _blocks(path: Path, member: str | None, skip: int) -> Iterator[tuple[int, by
 
 
 def _events(path: Path, member: str | None, layout: Layout) -> Iterator[Events | Rows]:
+    only_events = set(layout.names) == set("txyp")
     for number, block in _blocks(path, member, layout.skip):
         if not block or block.isspace():
             continue
         place = partial(_line, number, block)
+        if only_events and (b"x" in block or b"X" in block):  # 0x10, a number for pyarrow
+            yield _sorted_out(path, number, block, layout, place)
+            continue
         try:
             try:
                 table = _table(block, layout)
@@ -456,7 +460,7 @@ def _line(number: int, block: bytes, row: int) -> str:
 
 
 def _place(path: Path, member: str | None, layout: Layout, row: int) -> str:
-    """Reads the file again up to that row: for error messages only, which end the reading."""
+    """Reads the file again up to that row: for an error message, of which there is one."""
     for number, block in _blocks(path, member, layout.skip):
         rows = len(_filled(block))
         if row < rows:

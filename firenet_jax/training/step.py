@@ -91,9 +91,9 @@ def optimiser(settings: StepSettings) -> optax.GradientTransformation:
 
     Muon (Jordan et al. 2024) orthogonalises the update of a kernel, as a matrix (9 inputs,
     outputs); 0.2 is the usual root mean square of Adam's updates (Liu et al., arXiv 2502.16982).
-    With it biases and the 1x1 convolution use Adam with Nesterov's momentum (Dozat 2016), whose first
-    updates are larger than Adam's. "centred" is Muon, too, but with gradients and updates of centred
-    inputs (`centring`); its `update` takes their means.
+    With it biases and the 1x1 convolution use Adam with Nesterov's momentum (Dozat 2016), whose
+    first updates are larger than Adam's. "centred" is Muon, too, but with gradients and updates of
+    centred inputs (`centring`); its `update` takes their means.
     """
     rate = optax.warmup_cosine_decay_schedule(
         0.0, settings.learning_rate, settings.warmup, settings.steps, settings.learning_rate / 100
