@@ -20,6 +20,22 @@ shares its name with a public function: importing the module would hide the func
 
 import importlib
 import importlib.metadata
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # what editors and type checkers see of the names in _HOME
+    from firenet_jax.checkpoint import load_weights, save_weights
+    from firenet_jax.errors import FirenetError, RecordingError
+    from firenet_jax.events import Events, Recording
+    from firenet_jax.instants import grid
+    from firenet_jax.network import State, Weights, initial_state, step
+    from firenet_jax.pictures import Display, DisplayState, display, initial_display_state
+    from firenet_jax.readers import open_recording
+    from firenet_jax.readers.arrays import recording
+    from firenet_jax.reconstruction import images_at, reconstruct
+    from firenet_jax.storage.video import write_video
+    from firenet_jax.tensors import event_tensors, normalise, pack, voxelise
+
+    __version__: str
 
 _HOME = {
     "Display": "pictures",
@@ -48,10 +64,15 @@ _HOME = {
     "write_video": "storage.video",
 }
 
-__all__ = sorted(_HOME)
+__all__ = [  # written out, for type checkers
+    "Display", "DisplayState", "Events", "FirenetError", "Recording", "RecordingError", "State",
+    "Weights", "display", "event_tensors", "grid", "images_at", "initial_display_state",
+    "initial_state", "load_weights", "normalise", "open_recording", "pack", "recording",
+    "reconstruct", "save_weights", "step", "voxelise", "write_video",
+]  # fmt: skip
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     if name == "__version__":
         return importlib.metadata.version("firenet-jax")
     if name not in _HOME:
@@ -61,5 +82,5 @@ def __getattr__(name: str):
     return value
 
 
-def __dir__():
+def __dir__() -> list[str]:
     return __all__

@@ -6,6 +6,7 @@ imported only when the command is called, so `firenet --help` does not load jax.
 
 import contextlib
 import ctypes
+import difflib
 import importlib
 import inspect
 import io
@@ -114,6 +115,8 @@ def program() -> int:
         code = main()
     except SystemExit as stop:  # of the help and of what tyro cannot read
         code = int(stop.code or 0)
+    except BrokenPipeError:  # where nothing is kept back, `print` itself meets who reads no further
+        code = 1
     return _said(code)
 
 
@@ -164,7 +167,9 @@ def main(arguments: list[str] | None = None) -> int:
         print(version("firenet-jax"))
         return 0
     if arguments[0] not in COMMANDS:
-        print(f"firenet: no command {arguments[0]!r}\n\n{usage()}", file=sys.stderr)
+        near = difflib.get_close_matches(arguments[0], COMMANDS, 1)
+        meant = f", did you mean {near[0]}?" if near else ""
+        print(f"firenet: no command {arguments[0]!r}{meant}\n\n{usage()}", file=sys.stderr)
         return 2
 
     logging.basicConfig(format="firenet: %(message)s", level=logging.WARNING)
@@ -199,7 +204,3 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"firenet: error: {said}", file=sys.stderr)
         return 1
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(program())

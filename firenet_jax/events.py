@@ -346,7 +346,7 @@ def _first_error(
         if steps[row] < 0:
             return RecordingError(
                 f"{where}: time runs backwards, from {t[row] - steps[row]} to {t[row]} us: "
-                "sort the events by time, or --stop before"
+                "sort the events by time, or stop before (--stop)"
             )
         name, value = ("y", y[row]) if 0 <= x[row] < (width or np.inf) else ("x", x[row])
         if value < 0:
@@ -355,8 +355,8 @@ def _first_error(
                 "or of another format"
             )
         return RecordingError(
-            f"{where}: {name} is {value}, outside the sensor of {width}x{height} pixels: pass the "
-            "right --sensor-size WIDTHxHEIGHT"
+            f"{where}: {name} is {value}, outside the sensor of {width}x{height} pixels: pass its "
+            "right size (--sensor-size WIDTHxHEIGHT)"
         )
 
     return row, worded

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from firenet_jax import blocks, native
 from firenet_jax.convolution import layer
 from firenet_jax.events import BINS
+from firenet_jax.settings import check_arrays
 
 CHANNELS = 16
 
@@ -49,6 +50,15 @@ def initial_state(batch: int, height: int, width: int) -> State:
     """The state before the first window: zeros."""
     shape = batch, height, width, CHANNELS  # two arrays, so that a state can be donated
     return State(jnp.zeros(shape, jnp.float32), jnp.zeros(shape, jnp.float32))
+
+
+def check_state(state) -> None:
+    """Raises TypeError for anything else, such as None."""
+    if not isinstance(state, State):
+        raise TypeError(
+            f"the state is a {type(state).__name__}: make it with initial_state(batch, height, "
+            "width)"
+        )
 
 
 class Conv(nn.Module):
@@ -158,13 +168,25 @@ def step(
     Compiled once for each shape, also where it is called outside of `jax.jit`. On a CPU
     `reconstruct` is quicker: all of a window in one piece of machine code (`native.step`).
 
-    event_tensor: normalised if the weights expect it (`tensors.normalise`).
+    event_tensor: float32, normalised if the weights expect it (`tensors.normalise`). Images are
+    float32, 0 to 1 but for what goes beyond.
     exists: (B,) bool; where False the state is unchanged and the image is undefined (the event
     tensor must still be finite there, for example zeros).
     dtype: of the convolutions; jnp.bfloat16 trades accuracy for speed on accelerators.
+    Raises ValueError for shapes that do not match, TypeError for what is no array or state.
     """
     if isinstance(params, Weights):
         raise TypeError("step takes the parameters alone: pass weights.params")
+    check_state(state)
+    check_arrays(event_tensor=event_tensor)
+    shape = jnp.shape(event_tensor)
+    if len(shape) != 4 or shape[-1] != BINS:
+        raise ValueError(f"an event tensor of one window is (B, H, W, {BINS}), not {shape}")
+    if any(jnp.shape(h)[:-1] != shape[:-1] for h in state):
+        raise ValueError(
+            f"the state is of {jnp.shape(state.g1)[:-1]}, but an event tensor {shape} needs "
+            f"{shape[:-1]}: make it with initial_state(batch, height, width)"
+        )
     return _step(params, state, event_tensor, exists, native.is_wanted(), dtype)
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.special import ndtr  # not norm.cdf, the same: scipy.stats takes half a second to import
 
 from firenet_jax.errors import SettingsError
-from firenet_jax.settings import check_sizes
+from firenet_jax.settings import check_arrays, check_sizes
 
 HISTORY = 11  # images whose ranges have a median, which is the range shown
 # Of the automatic range: the part of the pixels that may be darker, and that may be brighter; what
@@ -121,8 +121,13 @@ def display(
     state is not used.
     valid: (T, B) bool; images that are not valid leave the state as it was. None: all are.
     Raises ValueError for images of another shape, or a state of another number of recordings, where
-    the range is not fixed.
+    the range is not fixed; TypeError for what is no array or no state.
     """
+    check_arrays(images=images, valid=valid)
+    if not isinstance(state, DisplayState):
+        raise TypeError(
+            f"the state is a {type(state).__name__}: make it with initial_display_state(batch)"
+        )
     if settings.unsharp:
         images = unsharp_mask(images, settings.unsharp)
     if settings.range == "fixed":

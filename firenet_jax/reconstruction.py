@@ -23,7 +23,16 @@ from firenet_jax.devices import BATCH, REPLICATED, TIME_BATCH, on_each_device
 from firenet_jax.errors import logger
 from firenet_jax.events import Recording, check_recording, until_damage
 from firenet_jax.instants import WARM_UP, Counts, Grid, Step, check, steps, warming
-from firenet_jax.network import BINS, CHANNELS, State, Weights, initial_params, initial_state, step
+from firenet_jax.network import (
+    BINS,
+    CHANNELS,
+    State,
+    Weights,
+    check_state,
+    initial_params,
+    initial_state,
+    step,
+)
 from firenet_jax.pictures import (
     Display,
     DisplayState,
@@ -31,6 +40,7 @@ from firenet_jax.pictures import (
     event_pictures,
     initial_display_state,
 )
+from firenet_jax.settings import check_arrays
 from firenet_jax.tensors import PACKED_SPECS, Packed, normalise, tensor_chunks, voxelise
 from firenet_jax.windows import Windows, cut, usual
 
@@ -40,8 +50,8 @@ class Network:
     """How the network runs."""
 
     recurrent: bool = True
-    """Whether the state is carried from window to window. With --no-recurrent each window starts
-    from a zero state (the ablation in Fig. 5 of the paper)."""
+    """With --no-recurrent each window starts from a zero state (the ablation in Fig. 5 of the
+    paper). By default the state is carried from window to window."""
     bfloat16: bool = False
     """Compute convolutions in bfloat16, slightly less accurate. For accelerators; slower on a
     CPU."""
@@ -140,11 +150,8 @@ def _checked(weights: Weights, state: State, tensors, valid):
             f"weights are a {type(weights).__name__}: pass Weights, as load_weights gives, whole "
             "and not their params"
         )
-    if not isinstance(state, State):
-        raise TypeError(
-            f"the state is a {type(state).__name__}: make it with initial_state(batch, height, "
-            "width)"
-        )
+    check_state(state)
+    check_arrays(tensors=tensors, valid=valid)
     if jnp.ndim(tensors) != 5 or jnp.shape(tensors)[-1] != BINS:
         raise ValueError(f"event tensors are (T, B, H, W, {BINS}), not {jnp.shape(tensors)}")
     shape = jnp.shape(tensors)[:4]

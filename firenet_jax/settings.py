@@ -1,4 +1,4 @@
-"""Command-line values -> checked, parsed values, or a SettingsError."""
+"""What a user passes -> checked, parsed values, or an error that says what is wrong with it."""
 
 import dataclasses
 import math
@@ -87,3 +87,10 @@ def check_range(name: str, bounds: tuple[float, float]) -> None:
             f"{name} is {least:g} {greatest:g}, but is drawn log-uniformly: "
             "both must be more than 0, the least first"
         )
+
+
+def check_arrays(**arrays) -> None:
+    """Raises TypeError for lists and the like; None is nothing to check."""
+    for name, array in arrays.items():
+        if array is not None and not hasattr(array, "shape"):
+            raise TypeError(f"{name} is a {type(array).__name__}: pass an array")

@@ -25,6 +25,7 @@ import numpy as np
 from firenet_jax.devices import BATCH, TIME_BATCH
 from firenet_jax.errors import SettingsError
 from firenet_jax.events import BINS, Events, Recording, check_recording
+from firenet_jax.settings import check_arrays
 from firenet_jax.windows import Windows, cut
 
 # A flat list of events is padded to one of these sizes. Padding costs a few ns per event, a new
@@ -70,14 +71,19 @@ def pack(
     size: padded length, at least the number of events; None: `capacity` of that number.
     bounds: (T, B, 2) int64 microseconds, t_min and t_max of each window; None: its least and
     greatest time.
+    Raises TypeError for windows that are no Events.
     Raises ValueError if rows are missing or of unequal length, if columns are of another kind than
     those of `Events`, if bounds are of another shape, not whole or end before they begin, if the
     events do not fit into `size`, or if there are 2^15 windows or more.
     """
+    if isinstance(windows, Events) or windows and isinstance(windows[0], Events):
+        raise TypeError("windows are T rows of B Events each: of one window, pass [[events]]")
     if not windows or not windows[0] or {len(row) for row in windows} != {len(windows[0])}:
         raise ValueError("windows are T rows of B windows each, T and B at least 1")
     shape = len(windows), len(windows[0])
     flat = [window for row in windows for window in row]
+    if others := [window for window in flat if not isinstance(window, Events)]:
+        raise TypeError(f"windows are T rows of B Events each, not of a {type(others[0]).__name__}")
     for name, kind in (("t", np.integer), ("x", np.int16), ("y", np.int16), ("p", np.bool_)):
         # Seconds would become one time, column 2^16 would become 0, and -1 true as 1 is.
         if not all(np.issubdtype(getattr(window, name).dtype, kind) for window in flat):
@@ -230,12 +236,17 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
 
 
 def normalise(tensors: jax.Array) -> jax.Array:
-    """(..., H, W, bins) -> the same, non-zero entries scaled to mean 0 and standard deviation 1.
+    """(..., H, W, bins) float -> the same, non-zero entries scaled to mean 0 and standard deviation
+    1.
 
     Each window by itself, over all bins, with the population standard deviation, as in the original
     program (the paper says "unit norm"). If the deviation is below 1e-6 the result is zero, so that
     empty windows and windows with a single value stay finite.
+    Raises ValueError for fewer than three axes.
     """
+    check_arrays(tensors=tensors)
+    if jnp.ndim(tensors) < 3:
+        raise ValueError(f"event tensors are (..., H, W, bins), not {jnp.shape(tensors)}")
     axes = (-3, -2, -1)
     voted = tensors != 0
     count = jnp.maximum(voted.sum(axes, keepdims=True), 1)

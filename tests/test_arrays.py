@@ -1,5 +1,8 @@
 """Arrays of one's own: what is taken, and what is refused by name."""
 
+import ast
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -113,11 +116,21 @@ def test_columns_of_unequal_length_are_no_events():
 def test_what_is_passed_for_weights_and_state_is_told_apart():
     weights, state = fj.load_weights(), fj.initial_state(1, 20, 24)
     tensors = np.zeros((1, 1, 20, 24, 5), np.float32)
-    recording = fj.recording(T, X, Y, P, **SIZE)
+    recording, event = fj.recording(T, X, Y, P, **SIZE), fj.Events.of([1], [2], [3], [1])
     for call, said in (
         (lambda: fj.reconstruct(weights.params, state, tensors), "pass Weights, as load_weights"),
         (lambda: fj.reconstruct(weights, None, tensors), "make it with initial_state"),
+        (lambda: fj.reconstruct(weights, state, tensors.tolist()), "tensors is a list"),
+        (lambda: fj.reconstruct(weights, state, tensors, [True]), "valid is a list"),
         (lambda: fj.step(weights, state, tensors[0]), "pass weights.params"),
+        (lambda: fj.step(weights.params, None, tensors[0]), "make it with initial_state"),
+        (lambda: fj.step(weights.params, state, tensors[0].tolist()), "event_tensor is a list"),
+        (lambda: fj.normalise(tensors.tolist()), "tensors is a list"),
+        (lambda: fj.display(None, tensors[..., 0]), "make it with initial_display_state"),
+        (lambda: fj.display(fj.initial_display_state(1), [[[[0.5]]]]), "images is a list"),
+        (lambda: fj.pack(event), r"pass \[\[events\]\]"),
+        (lambda: fj.pack([event]), r"pass \[\[events\]\]"),
+        (lambda: fj.pack([[(1, 2, 3, True)]]), "not of a tuple"),
         (lambda: next(fj.images_at(weights.params, recording, [25])), "pass Weights"),
         (lambda: next(fj.images_at(weights, "a.txt", [25])), "pass what open_recording gives"),
         (lambda: next(fj.event_tensors("a.txt")), "pass what open_recording gives"),
@@ -126,6 +139,27 @@ def test_what_is_passed_for_weights_and_state_is_told_apart():
             call()
     with pytest.raises(ValueError, match="come in order, but 21 us after 25 us"):
         list(fj.images_at(weights, recording, [25, 21]))
+    for tensor, said in (
+        (tensors, r"\(B, H, W, 5\), not \(1, 1, 20, 24, 5\)"), (tensors[0, 0], "B, H, W, 5"),
+        (np.moveaxis(tensors[0], -1, 1), "B, H, W, 5"), (tensors[0, :, 1:], "the state is of"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=said):
+            fj.step(weights.params, state, tensor)
+    with pytest.raises(ValueError, match=r"\(..., H, W, bins\), not \(5,\)"):
+        fj.normalise(tensors[0, 0, 0, 0])
+
+
+def test_type_checkers_see_the_names_that_are_there():
+    tree = ast.parse(Path(fj.__file__).read_text())
+    seen = {
+        alias.name: node.module
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    homes = {name: f"firenet_jax.{module}" for name, module in fj._HOME.items()}
+    assert seen == homes | {"TYPE_CHECKING": "typing", "Any": "typing"}
+    assert sorted(fj.__all__) == sorted(homes)
 
 
 def test_version_and_a_short_repr_of_weights():

@@ -54,7 +54,8 @@ def test_help_and_version(capsys):
     assert firenet(capsys, "--help")[0] == 0
     assert firenet(capsys, "--version")[1].strip()
     code, _, error = firenet(capsys, "nonsense")
-    assert code == 2 and "no command 'nonsense'" in error
+    assert code == 2 and "no command 'nonsense'\n" in error
+    assert "no command 'reconstuct', did you mean reconstruct?" in firenet(capsys, "reconstuct")[2]
     for command in cli.COMMANDS:
         with pytest.raises(SystemExit) as stop:
             cli.main([command, "--help"])
@@ -117,7 +118,7 @@ def test_recordings_on_both_sides_of_an_option_are_told_to_stand_together(capsys
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
 @pytest.mark.parametrize("line", ["--help", "convert --help"])
 def test_what_cannot_be_printed_is_one_sentence(line):
-    command = [sys.executable, "-m", "firenet_jax.cli", *line.split()]
+    command = [sys.executable, "-m", "firenet_jax", *line.split()]
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
     run = partial(subprocess.run, env=environment, stderr=subprocess.PIPE, text=True)
     with open("/dev/full", "w") as full:
@@ -128,6 +129,11 @@ def test_what_cannot_be_printed_is_one_sentence(line):
     os.close(reading)  # as `| head` does when it has seen enough
     with open(writing, "w") as pipe:
         ran = run(command, stdout=pipe)
+    assert (ran.returncode, ran.stderr) == (1, "")
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "w") as pipe:  # as in many containers
+        ran = run(command, stdout=pipe, env=environment | {"PYTHONUNBUFFERED": "1"})
     assert (ran.returncode, ran.stderr) == (1, "")
     closed = ["sh", "-c", 'exec "$0" "$@" <&- >&- 2>&-', *command]
     assert run(closed).returncode == 0
@@ -155,7 +161,7 @@ def test_the_program_runs_in_huge_pages_unless_told_otherwise(here, chosen):
 def test_names_that_are_no_text_can_be_said(here):
     name = os.fsencode(here / "caf") + b"\xe9.txt"
     os.rename(here / "a.txt", name)
-    command = [sys.executable, "-m", "firenet_jax.cli", "info", name]
+    command = [sys.executable, "-m", "firenet_jax", "info", name]
     environment = os.environ | {"PYTHONIOENCODING": "utf-8:strict"}
     ran = subprocess.run(command, env=environment, capture_output=True, timeout=60)
     assert ran.returncode == 0 and b"Traceback" not in ran.stderr, ran.stderr

@@ -27,6 +27,7 @@ LAYERS = [
     ["training"],
     ["commands"],
     ["cli"],
+    ["__main__"],
 ]
 # Each outside library enters by one door.
 DOORS = {

@@ -75,7 +75,7 @@ class Evaluate:
     e2vid_weights: Path | None = None
     """E2VID's published checkpoint, or E2VID+'s."""
     e2vid_sigmoid: bool = True
-    """E2VID ends in a sigmoid; E2VID+ does not: --no-e2vid-sigmoid."""
+    """--no-e2vid-sigmoid is for E2VID+, which does not end in a sigmoid as E2VID does."""
     e2vid_random: bool = False
     """Run E2VID with random weights, to measure its time."""
     events: Annotated[int | None, tyro.conf.arg(aliases=["-N"])] = None

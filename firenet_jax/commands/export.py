@@ -34,8 +34,8 @@ class Export:
 
     A file in .onnx is the network for onnxruntime, TensorRT, OpenVINO and browsers; in .stablehlo,
     the network for jax without this package; in .pth, the weights for rpg_e2vid, EVREAL and other
-    PyTorch programs; in .safetensors, the same weights for other libraries. This needs the extra
-    `export`.
+    PyTorch programs; in .safetensors, the same weights for other libraries. All but .pth need the
+    extra called export.
 
     Examples:
       firenet export -o firenet.onnx --picture
@@ -50,8 +50,8 @@ class Export:
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """A name that ends in .onnx, .stablehlo, .pth or .safetensors."""
     normalise: bool = True
-    """Normalise event tensors inside .onnx and .stablehlo, if the weights expect normalised ones.
-    With --no-normalise your program does it."""
+    """With --no-normalise, .onnx and .stablehlo expect event tensors that your program has
+    normalised. By default they normalise them, if the weights expect it."""
     picture: bool = False
     """.onnx and .stablehlo: also output the sharpened 8-bit picture."""
     web: Path | None = None

@@ -26,7 +26,7 @@ from firenet_jax.events import Events, Recording, counted, rate_in_words, until_
 from firenet_jax.instants import WARM_UP, Grid, check
 from firenet_jax.network import Weights
 from firenet_jax.pictures import Display
-from firenet_jax.readers import open_recording
+from firenet_jax.readers import check_exists, open_recording
 from firenet_jax.reconstruction import Network
 from firenet_jax.settings import check_none_idle, check_sizes, parse_size
 from firenet_jax.storage import video
@@ -189,6 +189,8 @@ def run(settings: Reconstruct) -> list[Path]:
     process, processes = share(settings.process, settings.processes)
     mine = slice(process, None, processes)
     planned = plan(settings.recordings, settings.output)
+    for path in settings.recordings if len(planned) > 1 else ():  # a slip, not damage: before all
+        check_exists(path)
     outputs = planned[mine]
     if not outputs:
         return []
@@ -293,7 +295,7 @@ def job_of(
     try:
         recording = open_recording(path, size, settings.strict, settings.columns)
     except RecordingError as error:
-        if len(settings.recordings) == 1 or not path.exists():
+        if len(settings.recordings) == 1:
             raise
         logger.warning("%s", error)
         outcome.failed[output] = error
@@ -370,7 +372,7 @@ def hot_pixels(choice: str, recording: Recording) -> np.ndarray:
     """`auto` or the name of a file -> (H, W) bool."""
     if choice == "auto":
         hot = filters.find_hot_pixels(recording)
-        logger.warning("%s: %d hot pixels are ignored", recording.path, hot.sum())
+        logger.warning("%s: left out: %s", recording.path, counted(int(hot.sum()), "hot pixel"))
         return hot
     return filters.read_hot_pixels(choice, recording.height, recording.width)
 

@@ -115,10 +115,15 @@ def is_recording(path: Path) -> bool:
     return any(module.matches(path) for module in modules)
 
 
-def _source(path: Path, sensor_size: tuple[int, int] | None, columns: str | None) -> Source:
-    """What the first format that knows the file reads from it."""
+def check_exists(path: Path) -> None:
+    """Raises RecordingError unless there is something of this name."""
     if not path.exists():
         raise RecordingError(f"{path}: there is no such file or folder: check the path")
+
+
+def _source(path: Path, sensor_size: tuple[int, int] | None, columns: str | None) -> Source:
+    """What the first format that knows the file reads from it."""
+    check_exists(path)
     check_no_pipe(path, RecordingError)
     check_readable(path, RecordingError)
     if path.is_file() and path.stat().st_size == 0:

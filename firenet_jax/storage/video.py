@@ -84,8 +84,8 @@ def check_kind(path: Path) -> None:
     happens = path.is_dir() and path.suffix.lower() not in (*WHOLE, *OTHER_FILES)
     if path.suffix not in WHOLE and like_a_file(path.suffix) and not happens:
         raise OutputError(
-            f"{path}: cannot write {path.suffix} files: name a folder (for png), .mp4, .gif, .h5, "
-            ".bag or .ros2"
+            f"{path}: cannot write {path.suffix} files: name a folder (for png), .mp4 or .gif, or "
+            "with reconstruct .h5, .bag or .ros2"
         )
 
 

@@ -87,7 +87,8 @@ def run(
         sources, validation = sources_of(settings, done)
         _keep_settings(folder, settings)  # only now, so that a failed start leaves no run behind
         log = Log(folder, done)
-        best, last_save = log.best() if _best(folder).exists() else math.inf, time.monotonic()
+        kept = (folder / "weights.npz").exists()
+        best, last_save = log.best() if kept else math.inf, time.monotonic()
         last = min(settings.steps, stop or settings.steps)
         with (
             contextlib.closing(log),
@@ -113,14 +114,14 @@ def run(
     if interrupted:
         raise KeyboardInterrupt(f"step {done} is saved: the same command goes on from there")
     if is_first():
-        if _best(folder).exists():
-            print(f"{_best(folder)}: best validation loss {best:.4f} in {done} steps")
-        else:
-            print(f"{folder / 'last.npz'}: after {done} steps; the best, weights.npz, is gone")
+        _say_result(folder, done, best)
 
 
-def _best(folder: Path) -> Path:
-    return folder / "weights.npz"
+def _say_result(folder: Path, done: int, best: float) -> None:
+    if (weights := folder / "weights.npz").exists():
+        print(f"{weights}: best validation loss {best:.4f} in {done} steps")
+    else:
+        print(f"{folder / 'last.npz'}: after {done} steps; the best, weights.npz, is gone")
 
 
 def _say_how_far(folder: Path, done: int, steps: int) -> None:
