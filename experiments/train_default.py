@@ -1172,22 +1172,12 @@ FAITHFUL = replace(READY, steps=701, motion=(0.5, 40.0), learning_rate=1e-3, see
 FINER = Holding(turning=4, turns=(6, 90), alike=4.0, faint=0.01, cut=48)
 MORE_HELD = FINER._replace(hold=4.0, alike=6.0, cut=64)
 READIES = mixed((CONSTANTS, 4), ({"eager": 1, "ready": 1}, 6))
-HOLDING = {  # the mean that each begins from, its settings, how it holds
-    "loyal": ({"rested": 1}, LOYAL, Holding()),
-    "trusty": ({"rested": 1}, TRUSTY, Holding()),
-    "fleet": (LOYALS, FLEET, Holding()),
-    "alert": (LOYALS, ALERT, Holding(faint=0.02)),
-    "constant": (SWIFTEST, CONSTANT, Holding(turning=4, turns=(6, 90), alike=4.0, faint=0.02)),
-    "eager": (CONSTANTS, EAGER, FINER),
-    "ready": (CONSTANTS, READY, FINER),
-    "faithful": (READIES, FAITHFUL, MORE_HELD),
-}
 # Less of CONSTANTS has more contrast, and remembers less: with half, slider_depth comes back from
 # forty rounds at .949. "ready" beside "eager" rests less well.
-LAST_MEAN = mixed((CONSTANTS, 28), ({"eager": 9, "faithful": 13}, 22))
-# For the next mean, not in the one that is built in: from that, 29 minutes, slow motion too, mostly
-# with faults, and brightness counts more. Four tenths of it remember better (slider_depth .968,
-# davis346_frames .963) and are as good in pictures, so that there may be more of "eager".
+EAGERS = mixed((CONSTANTS, 28), ({"eager": 9, "faithful": 13}, 22))
+# From that, 29 minutes, slow motion too, mostly with faults, and brightness counts more: it
+# remembers better. And 62 minutes, with hardly a clean sensor, from a mean in which "placid" makes
+# up for more of "eager": it shows more where little happens.
 PLACID = replace(
     FAITHFUL,
     steps=754,
@@ -1197,7 +1187,25 @@ PLACID = replace(
     loss=replace(FAITHFUL.loss, l1=3.0, lambda_tc=6.0),
     sensor=replace(FINE.sensor, clean=0.3),
 )
-NEXT = {"placid": (LAST_MEAN, PLACID, MORE_HELD)}
+PATIENT = replace(PLACID, steps=999, motion=(0.3, 40.0), slow=0.12, seed=1212,
+                  sensor=replace(FINE.sensor, clean=0.15))  # fmt: skip
+PLACIDS = mixed((CONSTANTS, 9), ({"eager": 6, "placid": 5}, 11))
+HOLDING = {  # the mean that each begins from, its settings, how it holds
+    "loyal": ({"rested": 1}, LOYAL, Holding()),
+    "trusty": ({"rested": 1}, TRUSTY, Holding()),
+    "fleet": (LOYALS, FLEET, Holding()),
+    "alert": (LOYALS, ALERT, Holding(faint=0.02)),
+    "constant": (SWIFTEST, CONSTANT, Holding(turning=4, turns=(6, 90), alike=4.0, faint=0.02)),
+    "eager": (CONSTANTS, EAGER, FINER),
+    "ready": (CONSTANTS, READY, FINER),
+    "faithful": (READIES, FAITHFUL, MORE_HELD),
+    "placid": (EAGERS, PLACID, MORE_HELD),
+    "patient": (PLACIDS, PATIENT, MORE_HELD),
+}
+# A stage of 40 minutes from PLACIDS on clean sensors alone, judged by what is left after
+# equalisation, is no better than EAGERS in their dense windows (.627 : .625 of equalised SSIM;
+# published .646), so that what is missing there is not a matter of what counts.
+LAST_MEAN = mixed((EAGERS, 2), ({"placid": 1, "patient": 1}, 2))
 # The candidate of the second ConvGRU has this share of that of DUSKY, which "vast" began from; the
 # rest is, up to "rapid", that of "vast", and later of the mean itself. More of it remembers better
 # what goes to and fro, and rests less well. FORMER had half.
@@ -1228,12 +1236,12 @@ def train(folder: Path, images: Path) -> None:
         weights = folder / name / "last.npz"
         run(settings, stop)
     mean = given(average(folder, SHIPPED, folder / "mean.npz"), held(folder), *REMEMBERS)
-    for name in ("rested", *HOLDING, *NEXT):
+    for name in ("rested", *HOLDING):
         (folder / name).mkdir(exist_ok=True)
     rested = folder / "rested" / "last.npz"
     settings = replace(RESTED, output=rested.parent, images=images)
     keep_at_rest(mean, settings, rested, steps=300, rate=2e-4)
-    for name, (parts, settings, how) in (HOLDING | NEXT).items():
+    for name, (parts, settings, how) in HOLDING.items():
         made = folder / name / "last.npz"
         settings = replace(settings, output=made.parent, images=images)
         begun = average(folder, parts, folder / f"before_{name}.npz")
