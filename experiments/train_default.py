@@ -62,7 +62,7 @@ equalisation compared a pixel with 36 others, in which differences below 0.1 did
 The report is written to results/train_default.json, the curve to results/train_default.png. Stages
 that are not in RUN, because they ran elsewhere, keep what was reported of them; of "dusk" to
 "vast", of "grand" and "open" nothing was, but the steps, nor of those from "brisk" on, which
-validated nothing. "rested" counts among none.
+validated nothing.
 """
 
 import json
@@ -1091,6 +1091,7 @@ RESTED = replace(
     seed=77,
     scene=replace(FINE.scene, pause=0.0, halt=0.0),
 )
+REST_STEPS = 300
 # From what came of that, on truth again, all parts, while what the network remembers is held
 # (`holding`): mostly clean sensors in larger pictures, and mostly faulty ones. (They ran from a
 # draft, with other random numbers, for 65 minutes each.) A fifth of each is as good in dense
@@ -1240,7 +1241,7 @@ def train(folder: Path, images: Path) -> None:
         (folder / name).mkdir(exist_ok=True)
     rested = folder / "rested" / "last.npz"
     settings = replace(RESTED, output=rested.parent, images=images)
-    keep_at_rest(mean, settings, rested, steps=300, rate=2e-4)
+    keep_at_rest(mean, settings, rested, steps=REST_STEPS, rate=2e-4)
     for name, (parts, settings, how) in HOLDING.items():
         made = folder / name / "last.npz"
         settings = replace(settings, output=made.parent, images=images)
@@ -1360,6 +1361,7 @@ def report(folder: Path) -> None:
         steps = [done + entry["step"] for entry in validations]
         axes.plot(steps, [entry["ssim"] for entry in validations], "o-", label=name)
         done, seconds = done + stages[name]["steps"], seconds + stages[name]["seconds"]
+    lost |= {"rested": REST_STEPS}
     lost |= {name: settings.steps for name, (_, settings, _) in HOLDING.items()}
     axes.set(xlabel="steps", ylabel="validation SSIM, each stage's own")
     figure.legend(loc="outside right upper", fontsize=7)
