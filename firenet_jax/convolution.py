@@ -7,7 +7,7 @@ where there are few channels, except for the gradient with respect to the kernel
 XLA's own takes many times as long as the matrix products below.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -107,12 +107,9 @@ def _joined(maps):
     return maps[0] if len(maps) == 1 else jnp.concatenate(maps, -1)
 
 
-def choose(machine_code: bool, *functions_and_arguments) -> Any:
-    """As `native.choose`, but the second function if machine code is not wanted."""
-    if machine_code:
-        return native.choose(*functions_and_arguments)
-    _, otherwise, *arguments = functions_and_arguments
-    return otherwise(*arguments)
+def choose(machine_code: bool, own: Callable, xla: Callable, *arguments) -> Any:
+    """`native.choose` of the two; XLA's if machine code is not wanted."""
+    return native.choose(own, xla, *arguments) if machine_code else xla(*arguments)
 
 
 def turned(kernel: jax.Array) -> jax.Array:

@@ -324,19 +324,19 @@ def test_remat_and_bfloat16_change_little(tmp_path):
 
 def begun(folder, settings):
     """A run's folder before its first step."""
-    train._check_settings(folder, settings)
+    train._check_folder(folder, settings)
     train._keep_settings(folder, settings)
 
 
 def test_other_settings_do_not_continue_a_run(tmp_path):
     begun(tmp_path, tiny(tmp_path))
-    train._check_settings(tmp_path, tiny(tmp_path))
+    train._check_folder(tmp_path, tiny(tmp_path))
     with pytest.raises(ValueError, match=r"other settings \(seed was 0, now 1\)"):
-        train._check_settings(tmp_path, tiny(tmp_path, seed=1))
+        train._check_folder(tmp_path, tiny(tmp_path, seed=1))
     with pytest.raises(ValueError, match=r"\(loss.l1 was 1, now 0.5\)"):
-        train._check_settings(tmp_path, tiny(tmp_path, loss=replace(SHORT, l1=0.5)))
+        train._check_folder(tmp_path, tiny(tmp_path, loss=replace(SHORT, l1=0.5)))
     # how often it is looked at says nothing about what is computed
-    train._check_settings(tmp_path, tiny(tmp_path, log_every=7, save_every=60.0, validate_every=4))
+    train._check_folder(tmp_path, tiny(tmp_path, log_every=7, save_every=60.0, validate_every=4))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
@@ -357,7 +357,7 @@ def test_an_output_that_is_a_file(tmp_path):
 def test_a_run_that_failed_before_its_first_step_blocks_no_folder(tmp_path):
     with pytest.raises(ValueError, match="no such folder"):
         run(tiny(tmp_path / "run", images=tmp_path / "typo"))
-    train._check_settings(tmp_path / "run", tiny(tmp_path / "run"))
+    train._check_folder(tmp_path / "run", tiny(tmp_path / "run"))
 
 
 def test_a_run_older_than_an_option_goes_on_if_that_stands_at_its_default(tmp_path):
@@ -368,11 +368,11 @@ def test_a_run_older_than_an_option_goes_on_if_that_stands_at_its_default(tmp_pa
     path.write_text(json.dumps(older))
     other = tiny(tmp_path).scene
     with pytest.raises(ValueError, match="other settings"):
-        train._check_settings(tmp_path, tiny(tmp_path, scene=replace(other, hdr=0.5)))
-    train._check_settings(tmp_path, tiny(tmp_path))
+        train._check_folder(tmp_path, tiny(tmp_path, scene=replace(other, hdr=0.5)))
+    train._check_folder(tmp_path, tiny(tmp_path))
     path.write_text('{"steps": 1')
     with pytest.raises(ValueError, match="settings.json is damaged"):
-        train._check_settings(tmp_path, tiny(tmp_path))
+        train._check_folder(tmp_path, tiny(tmp_path))
 
 
 def test_another_process_never_sees_half_of_the_settings(tmp_path, monkeypatch):
@@ -382,7 +382,7 @@ def test_another_process_never_sees_half_of_the_settings(tmp_path, monkeypatch):
         write(path, content[:10])
         with monkeypatch.context() as other:
             other.setattr(train, "is_first", lambda: False)
-            train._check_settings(tmp_path, settings)
+            train._check_folder(tmp_path, settings)
         looks.append(path)
         write(path, content)
 
@@ -523,11 +523,11 @@ def test_a_run_resumes_on_the_files_that_it_began_with(tmp_path, ending):
     (tmp_path / "run").mkdir()
     (tmp_path / "run/settings.json").write_text(json.dumps(record))
     with pytest.raises(OutputError, match="set has changed since the run in .*run began"):
-        train._check_settings(asked.output, asked)
+        train._check_folder(asked.output, asked)
     without = {name: value for name, value in record.items() if name != "files"}
     for earlier in (without, record | {"files": None}):  # of runs of before they were recorded
         (tmp_path / "run/settings.json").write_text(json.dumps(earlier))
-        train._check_settings(asked.output, asked)
+        train._check_folder(asked.output, asked)
 
 
 def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypatch):

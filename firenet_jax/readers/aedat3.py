@@ -26,10 +26,10 @@ import numpy as np
 from firenet_jax.errors import RecordingError, logger
 from firenet_jax.events import Frames
 from firenet_jax.readers import Source, aedat, all_triggers, joined, reading, to_chunks, to_frame
+from firenet_jax.readers.libcaer import EVENT, fields
 
 SPECIAL, POLARITY, FRAME = 0, 1, 2
 HEAD = struct.Struct("<2h6i")
-EVENT = np.dtype([("data", "<u4"), ("t", "<i4")])
 FRAME_HEAD = np.dtype(
     [("info", "<u4"), ("begin", "<i4"), ("end", "<i4"), ("open", "<i4"), ("shut", "<i4"),
      ("width", "<i4"), ("height", "<i4"), ("x", "<i4"), ("y", "<i4")]
@@ -143,7 +143,7 @@ def _columns(layout: Layout, kind: int) -> Iterator[tuple[np.ndarray, np.ndarray
 
 def _events(layout: Layout) -> Iterator[tuple[np.ndarray, ...]]:
     for data, t in _columns(layout, POLARITY):
-        yield t, data >> 17, data >> 2 & 0x7FFF, data >> 1 & 1
+        yield t, *fields(data)
 
 
 def _triggers(layout: Layout) -> Iterator[np.ndarray]:

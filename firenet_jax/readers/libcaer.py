@@ -58,9 +58,14 @@ def decode(
     return State(int(columns[-1]), base), (time[word], x[word], y, on)
 
 
+def fields(data: np.ndarray) -> tuple[np.ndarray, ...]:
+    """(N,) uint32 of events -> (x, y, p): column, row, 0 or 1."""
+    return data >> 17, data >> 2 & 0x7FFF, data >> 1 & 1
+
+
 def decode_plain(payload: bytes, time_base: int) -> tuple[np.ndarray, ...]:
     """A message of libcaer, its time_base in microseconds -> (t, x, y, p), as above."""
     events = np.frombuffer(payload, EVENT, len(payload) // EVENT.itemsize)
     data, t = events["data"], events["t"].astype(np.int64)
     t = time_base + (unwrap(t, 31, int(t[0])) if t.size else t)
-    return t, data >> 17, data >> 2 & 0x7FFF, data >> 1 & 1
+    return t, *fields(data)

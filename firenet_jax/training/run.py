@@ -72,7 +72,7 @@ def run(
             f"{jax.device_count()} devices: choose a multiple of that"
         )
     folder = settings.output
-    _check_settings(folder, settings)
+    _check_folder(folder, settings)
     state = first_state(settings)
     options = ocp.CheckpointManagerOptions(max_to_keep=2)
     with (
@@ -291,23 +291,29 @@ def _files(settings: Train) -> str | None:
     return hashlib.sha256(repr(found).encode()).hexdigest()[:16]
 
 
-def _check_settings(folder: Path, settings: Train) -> None:
-    """Raises OutputError if the folder holds a run of other settings.
-
-    Options that did not exist when the run began count as their defaults. Those of `UNRECORDED` may
-    change.
-    """
+def _check_folder(folder: Path, settings: Train) -> None:
+    """Makes it, if it is missing. Raises OutputError for a folder of somebody else, or of a run
+    with other settings."""
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder} is a file, but a run needs a folder: choose another --output")
     runs.make_folder(folder)
     found = runs.read_record(folder / "settings.json", "choose another --output")
-    if found is None:
-        for name in WRITTEN:
-            if (folder / name).exists():
-                raise OutputError(
-                    f"{folder} holds {name}, but no settings.json of a run: choose another --output"
-                )
+    if found is not None:
+        _check_settings(folder, found, settings)
         return
+    for name in WRITTEN:
+        if (folder / name).exists():
+            raise OutputError(
+                f"{folder} holds {name}, but no settings.json of a run: choose another --output"
+            )
+
+
+def _check_settings(folder: Path, found: dict, settings: Train) -> None:
+    """Raises OutputError unless the run with the record `found` goes on with these settings.
+
+    Options that did not exist when the run began count as their defaults. Those of `UNRECORDED` may
+    change, and a run that is done may become longer.
+    """
     now = _record(settings)
     if found.get("files") is None:  # a run of before it was kept
         found["files"] = now["files"]
