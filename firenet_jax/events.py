@@ -72,6 +72,7 @@ class Events:
 
     @classmethod
     def empty(cls) -> "Events":
+        """No events."""
         return cls.of([], [], [], [])
 
 
@@ -168,6 +169,7 @@ class Recording:
 
     @property
     def pixels(self) -> int:
+        """Of the sensor, how many."""
         return self.height * self.width
 
 

@@ -146,7 +146,9 @@ def _in_order(times: Iterable[int]) -> Iterator[int]:
     last = None
     for time in times:
         if time != time // 1:  # NaN differs, too
-            raise SettingsError(f"times of images are whole microseconds, {time} is none")
+            raise SettingsError(
+                f"times of images are whole microseconds, {time} is none: round 1e6 times seconds"
+            )
         if last is not None and time < last:
             raise SettingsError(f"times of images come in order, but {time} us after {last} us")
         yield time
@@ -238,8 +240,14 @@ class Grid:
 
 
 def grid(first: int, rate: float, from_zero: bool = False) -> Grid:
-    """`rate` times per second, from `first` on; from_zero: on the grid through time 0."""
+    """Endless times in microseconds, `rate` per second: `first` and those after it.
+
+    first: whole microseconds. from_zero: the times of the grid through 0, from `first` on.
+    Raises SettingsError for a first that is not whole and for a rate that cannot be.
+    """
     check_rate(rate)
+    if first != int(first):
+        raise SettingsError(f"first is {first}, but must be whole microseconds")
     if not from_zero:
         return Grid(first, rate)
     return Grid(0, rate, math.ceil(first / (1_000_000 / Fraction(str(rate)))))

@@ -303,7 +303,8 @@ def images_at(
     up to its time and those of the warm-up, not on which other times are requested.
     chunk: steps per call of the device. Memory holds one chunk, whatever the recording's length.
     warm_up: windows of the beginning that the network sees beforehand, see `instants.warming`.
-    Raises ValueError for invalid windows, RecordingError if the file is damaged.
+    Raises ValueError for invalid windows and for times that are not whole or not in order,
+    RecordingError if the file is damaged.
     """
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but must be 1 or more steps")
