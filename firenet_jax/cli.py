@@ -62,8 +62,9 @@ def usage() -> str:
     return (
         "firenet_jax: event camera recordings become video (FireNet in JAX)\n\n"
         f"{commands}\n\n"
-        "firenet COMMAND --help explains a command and gives examples. With FIRENET_DEBUG=1\n"
-        "in the environment, errors show a traceback. firenet --version prints the version."
+        "firenet COMMAND --help explains a command and gives examples.\n"
+        "firenet --version prints the version. With FIRENET_DEBUG=1 in the environment,\n"
+        "errors show a traceback."
     )
 
 
