@@ -121,17 +121,17 @@ def display(
     state is not used.
     valid: (T, B) bool; images that are not valid leave the state as it was. None: all are.
     Raises ValueError for images of another shape, or a state of another number of recordings, where
-    the range is not fixed; TypeError for what is no array or no state.
+    the range is not fixed; TypeError for what is no array, or then no state.
     """
     check_arrays(images=images, valid=valid)
-    if not isinstance(state, DisplayState):
-        raise TypeError(
-            f"the state is a {type(state).__name__}: make it with initial_display_state(batch)"
-        )
     if settings.unsharp:
         images = unsharp_mask(images, settings.unsharp)
     if settings.range == "fixed":
         return state, _to_8_bit(images, settings.bilateral)
+    if not isinstance(state, DisplayState):
+        raise TypeError(
+            f"the state is a {type(state).__name__}: make it with initial_display_state(batch)"
+        )
     if images.ndim != 4 or len(state.low) != images.shape[1]:
         raise ValueError(
             f"images of shape {images.shape} and the state of {len(state.low)} recordings: "

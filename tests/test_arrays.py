@@ -137,6 +137,7 @@ def test_what_is_passed_for_weights_and_state_is_told_apart():
     ):
         with pytest.raises(TypeError, match=said):
             call()
+    assert fj.display(None, tensors[..., 0], settings=fj.Display(range="fixed"))[0] is None
     with pytest.raises(ValueError, match="come in order, but 21 us after 25 us"):
         list(fj.images_at(weights, recording, [25, 21]))
     for tensor, said in (
