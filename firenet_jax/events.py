@@ -50,9 +50,9 @@ class Events:
     @classmethod
     def of(cls, t, x, y, p) -> "Events":
         """Columns of integers -> Events with the dtypes above; p is bool, 0 and 1, or -1 and 1.
-        Raises ValueError unless the columns are flat and of one length, the times whole
-        microseconds and the coordinates whole numbers that int16 holds. `recording` and the readers
-        also check that events lie on the sensor, and in order of time."""
+        Raises ValueError unless the columns are of numbers, flat and of one length, the times whole
+        microseconds, the coordinates whole numbers that int16 holds and p is as above. `recording`
+        and the readers also check that events lie on the sensor, and in order of time."""
         t, x, y, p = map(np.asarray, (t, x, y, p))
         if not t.shape == x.shape == y.shape == p.shape:
             raise ValueError(
@@ -60,6 +60,11 @@ class Events:
             )
         if t.ndim != 1:
             raise ValueError(f"columns are of shape (N,), not {t.shape}")
+        strange = [name for name, c in zip("txyp", (t, x, y, p), strict=True) if not _real(c)]
+        if strange:
+            raise ValueError(f"columns are of numbers, but {', '.join(strange)} are not")
+        if not (p.dtype == bool or ((p == 0) | (p == 1) | (p == -1)).all()):
+            raise ValueError(f"p must be 0 and 1, or -1 and 1, not {p.min()} to {p.max()}")
         whole = t.dtype.kind in "biu" or t.dtype.kind == "f" and bool((t == np.rint(t)).all())
         if not whole or t.size and max(t.max(), -float(t.min())) >= 2.0**63:
             raise ValueError("times must be whole microseconds: round 1e6 times seconds")
@@ -74,6 +79,10 @@ class Events:
     def empty(cls) -> "Events":
         """No events."""
         return cls.of([], [], [], [])
+
+
+def _real(column: np.ndarray) -> bool:
+    return column.dtype.kind in "biuf" or not column.size
 
 
 def _coordinates(name: str, column: np.ndarray) -> np.ndarray:

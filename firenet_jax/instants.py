@@ -74,6 +74,7 @@ def steps(
     times: microseconds on the recording's clock, in order; may be endless. Times before the first
     event or after the last one get no image. An image at t has seen all events up to and at t.
     cutter: the recording's windows; None: those that `windows` cut. counts: filled in.
+    Ends with the window in which the last of the times lies.
     Raises SettingsError for windows that overlap or lie between frames, and RecordingError as `cut`
     does, after the steps up to the damage.
     """
@@ -102,6 +103,8 @@ def steps(
                 f"{recording.path}: no event from {pause[0] / 1e6:.6f} to {pause[1] / 1e6:.6f} s, "
                 "more than an hour: leave one side out with --start or --stop, or use --at"
             )
+        if time is None:  # no image depends on what follows, which may be hours
+            return
     if time is not None and (grid is None or not counts.seen):
         counts.late += 1 + (sum(1 for _ in times) if sized else 0)
 

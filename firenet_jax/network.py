@@ -178,7 +178,7 @@ def step(
     if isinstance(params, Weights):
         raise TypeError("step takes the parameters alone: pass weights.params")
     check_state(state)
-    check_arrays(event_tensor=event_tensor)
+    check_arrays(event_tensor=event_tensor, exists=exists)
     shape = jnp.shape(event_tensor)
     if len(shape) != 4 or shape[-1] != BINS:
         raise ValueError(f"an event tensor of one window is (B, H, W, {BINS}), not {shape}")
@@ -187,7 +187,13 @@ def step(
             f"the state is of {jnp.shape(state.g1)[:-1]}, but an event tensor {shape} needs "
             f"{shape[:-1]}: make it with initial_state(batch, height, width)"
         )
-    return _step(params, state, event_tensor, exists, native.is_wanted(), dtype)
+    if exists is not None and (exists.shape != shape[:1] or exists.dtype != bool):
+        raise ValueError(
+            f"exists is {exists.dtype} of shape {exists.shape}, but must be bool {shape[:1]}"
+        )
+    # Of float64, as numpy makes it, in a program with jax_enable_x64.
+    inputs = jax.tree.map(partial(jnp.asarray, dtype=jnp.float32), (state, event_tensor))
+    return _step(params, *inputs, exists, native.is_wanted(), dtype)
 
 
 @partial(jax.jit, static_argnums=(4, 5), inline=True)

@@ -120,10 +120,11 @@ def display(
     `automatic_range`, or of clip(min, 0, 0.45) and clip(max, 0.55, 1). Where the range is fixed the
     state is not used.
     valid: (T, B) bool; images that are not valid leave the state as it was. None: all are.
-    Raises ValueError for images of another shape, or a state of another number of recordings, where
-    the range is not fixed; TypeError for what is no array, or then no state.
+    Raises ValueError for images of another shape, a state of another number of recordings, or
+    another valid, where the range is not fixed; TypeError for what is no array, or then no state.
     """
     check_arrays(images=images, valid=valid)
+    images = jnp.asarray(images, jnp.float32)
     if settings.unsharp:
         images = unsharp_mask(images, settings.unsharp)
     if settings.range == "fixed":
@@ -139,6 +140,10 @@ def display(
         )
     if valid is None:
         valid = jnp.ones(images.shape[:2], bool)
+    if valid.shape != images.shape[:2] or valid.dtype != bool:
+        raise ValueError(
+            f"valid is {valid.dtype} of shape {valid.shape}, but must be bool {images.shape[:2]}"
+        )
     if settings.range == "auto":
         lows, highs = automatic_range(images)
     else:

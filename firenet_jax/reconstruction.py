@@ -145,11 +145,7 @@ _quickest.defvjp(_forward, _backward)
 def _checked(weights: Weights, state: State, tensors, valid):
     """`reconstruct`'s arrays in float32. Raises ValueError if they do not match, TypeError for
     other objects in place of weights or state."""
-    if not isinstance(weights, Weights):
-        raise TypeError(
-            f"weights are a {type(weights).__name__}: pass Weights, as load_weights gives, whole "
-            "and not their params"
-        )
+    _check_weights(weights)
     check_state(state)
     check_arrays(tensors=tensors, valid=valid)
     if jnp.ndim(tensors) != 5 or jnp.shape(tensors)[-1] != BINS:
@@ -174,6 +170,14 @@ def _checked(weights: Weights, state: State, tensors, valid):
     params = _as_float32(weights.params, "parameters")
     state, tensors = _as_float32(state, "state"), _as_float32(tensors, "event tensors")
     return replace(weights, params=params), state, tensors, valid
+
+
+def _check_weights(weights) -> None:
+    if not isinstance(weights, Weights):
+        raise TypeError(
+            f"weights are a {type(weights).__name__}: pass Weights, as load_weights gives, whole "
+            "and not their params"
+        )
 
 
 def _as_float32(tree, name: str):
@@ -304,12 +308,14 @@ def images_at(
     chunk: steps per call of the device. Memory holds one chunk, whatever the recording's length.
     warm_up: windows of the beginning that the network sees beforehand, see `instants.warming`.
     Raises ValueError for invalid windows and for times that are not whole or not in order,
-    RecordingError if the file is damaged.
+    RecordingError if the file is damaged before the last of them, TypeError for what are no weights
+    or is no recording.
     """
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but must be 1 or more steps")
     if warm_up < 0:
         raise ValueError(f"warm_up is {warm_up}, but must be 0 or more windows")
+    _check_weights(weights)
     check_recording(recording)
     chosen = Windows(**windows) if windows else usual(until_damage(recording.events()))
     check(chosen)

@@ -242,14 +242,16 @@ def normalise(tensors: jax.Array) -> jax.Array:
     Each window by itself, over all bins, with the population standard deviation, as in the original
     program (the paper says "unit norm"). If the deviation is below 1e-6 the result is zero, so that
     empty windows and windows with a single value stay finite.
+    Floats of fewer than 32 bits, of which the sums would overflow, become float32.
     Raises ValueError for fewer than three axes.
     """
     check_arrays(tensors=tensors)
     if jnp.ndim(tensors) < 3:
         raise ValueError(f"event tensors are (..., H, W, bins), not {jnp.shape(tensors)}")
     axes = (-3, -2, -1)
+    tensors = jnp.asarray(tensors, jnp.promote_types(jnp.result_type(tensors), jnp.float32))
     voted = tensors != 0
-    count = jnp.maximum(voted.sum(axes, keepdims=True), 1)
+    count = jnp.maximum(voted.sum(axes, keepdims=True), 1).astype(tensors.dtype)
     mean = tensors.sum(axes, keepdims=True) / count
     centred = jnp.where(voted, tensors - mean, 0.0)
     variance = (centred**2).sum(axes, keepdims=True) / count

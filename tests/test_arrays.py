@@ -99,6 +99,7 @@ def test_they_become_tensors():
         ({"width": 10**6}, "width is 1000000, but is a number of pixels, at most 32768"),
         ({"x": None, "y": None, "p": None}, "pass t, x, y and p, or one structured array"),
         ({"x": None}, "pass t, x, y and p"),
+        ({"t": np.ma.masked_array(T, [0, 1, 0, 0])}, "some entries are masked"),
         ({"t": np.zeros(3, [("a", "i4")]), "x": None, "y": None, "p": None}, "has the fields a,"),
     ],
 )  # fmt: skip
@@ -125,6 +126,7 @@ def test_what_is_passed_for_weights_and_state_is_told_apart():
         (lambda: fj.step(weights, state, tensors[0]), "pass weights.params"),
         (lambda: fj.step(weights.params, None, tensors[0]), "make it with initial_state"),
         (lambda: fj.step(weights.params, state, tensors[0].tolist()), "event_tensor is a list"),
+        (lambda: fj.step(weights.params, state, tensors[0], [True]), "exists is a list"),
         (lambda: fj.normalise(tensors.tolist()), "tensors is a list"),
         (lambda: fj.display(None, tensors[..., 0]), "make it with initial_display_state"),
         (lambda: fj.display(fj.initial_display_state(1), [[[[0.5]]]]), "images is a list"),
@@ -132,6 +134,7 @@ def test_what_is_passed_for_weights_and_state_is_told_apart():
         (lambda: fj.pack([event]), r"pass \[\[events\]\]"),
         (lambda: fj.pack([[(1, 2, 3, True)]]), "not of a tuple"),
         (lambda: next(fj.images_at(weights.params, recording, [25])), "pass Weights"),
+        (lambda: next(fj.images_at("w.npz", recording, [25])), "weights are a str: pass Weights"),
         (lambda: next(fj.images_at(weights, "a.txt", [25])), "pass what open_recording gives"),
         (lambda: next(fj.event_tensors("a.txt")), "pass what open_recording gives"),
     ):
@@ -146,6 +149,9 @@ def test_what_is_passed_for_weights_and_state_is_told_apart():
     ):  # fmt: skip
         with pytest.raises(ValueError, match=said):
             fj.step(weights.params, state, tensor)
+    for exists in (np.array([255], np.uint8), np.ones((1, 1), bool), np.ones(2, bool)):
+        with pytest.raises(ValueError, match=r"exists is .*, but must be bool \(1,\)"):
+            fj.step(weights.params, state, tensors[0], exists)
     with pytest.raises(ValueError, match=r"\(..., H, W, bins\), not \(5,\)"):
         fj.normalise(tensors[0, 0, 0, 0])
 

@@ -149,6 +149,12 @@ def test_windows_that_are_of_no_use_for_it(recording, way):
         next(steps(recording, Windows(**way), [1]))
 
 
+def test_what_follows_the_last_time_is_not_looked_at(recording):
+    found = list(steps(recording, Windows(events=90), [FIRST + 30_000]))
+    wanted = next(k for k, step in enumerate(found) if step.time is not None)
+    assert 0 < wanted < 6 and len(found) == wanted + 2  # and the window in which it lies
+
+
 def test_no_events_and_windows_without_any():
     assert list(steps(recording_of(Events.empty()), Windows(events=5), [1])) == []
     t = np.array([0, 1, 9_000], np.int64) + FIRST

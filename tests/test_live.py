@@ -662,6 +662,28 @@ def test_a_taken_port_is_one_sentence(tmp_path, monkeypatch, capsys):
     assert "pass another --port" in capsys.readouterr().err
 
 
+def test_a_connection_that_breaks_is_told_after_what_was_seen(tmp_path, monkeypatch, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def send():
+            connection, _ = server.accept()
+            rows = "".join(f"{200 * n} {n % 20} {n % 12} 1\n" for n in range(2000))
+            connection.sendall(rows.encode())
+            time.sleep(1)
+            off = struct.pack("ii", 1, 0)  # closing it is a reset
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, off)
+            connection.close()
+
+        sender = threading.Thread(target=send)
+        sender.start()
+        source = f"TCP://127.0.0.1:{server.getsockname()[1]}"
+        found = ["live", source, "--wire", "text", "--sensor-size", "20x12", "--port", "0"]
+        assert cli.main(found) == 1
+        sender.join()
+    said = capsys.readouterr()
+    assert "the connection broke" in said.err and "pictures of" in said.out
+
+
 def test_it_ends_after_so_many_seconds(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write_text(tmp_path / "a.txt")

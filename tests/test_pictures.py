@@ -215,6 +215,12 @@ def test_no_windows_are_no_pictures(range):
     assert pictures.shape == (0, 1, 8, 9)
 
 
+@pytest.mark.parametrize("valid", [np.ones((3, 1), int), np.ones(3, bool), np.ones((1, 3), bool)])
+def test_which_are_valid_is_said_of_each_image(valid):
+    with pytest.raises(ValueError, match=r"must be bool \(3, 1\)"):
+        display(initial_display_state(1), jnp.zeros((3, 1, 8, 9)), valid)
+
+
 @pytest.mark.parametrize("shape", [(3, 8, 9), (3, 2, 8, 9)])
 def test_images_of_another_shape_are_refused(shape):
     with pytest.raises(ValueError, match=r"the state of 1 recordings: expected \(T, B, H, W\)"):

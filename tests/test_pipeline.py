@@ -1,11 +1,14 @@
+import dataclasses
 import gzip
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import textwrap
 import threading
+import time
 from pathlib import Path
 
 import av
@@ -540,6 +543,31 @@ def test_nothing_runs_on_after_an_error_that_is_kept(tmp_path, weights, monkeypa
     with pytest.raises(OSError, match="no room") as kept:
         run(settings(weights, (recording,), tmp_path / "out"))
     assert kept.tb and not {t for t in set(threading.enumerate()) - before if t.name != "pack_0"}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no signal reaches a thread there")
+def test_an_interrupted_run_does_not_wait_for_what_is_read(tmp_path, weights, monkeypatch):
+    """Such as before --start: nothing comes to the device, and nothing looks whether it is to."""
+    recording = open_recording(write_recording(tmp_path / "a.txt"))
+    begun = time.monotonic()
+
+    def endless():
+        events = next(recording.events())
+        while time.monotonic() - begun < 60:
+            yield events
+            time.sleep(0.01)
+
+    opened = dataclasses.replace(recording, events=endless)
+    monkeypatch.setattr(reconstruct, "open_recording", lambda *_: opened)
+    main = threading.main_thread().ident
+    timer = threading.Timer(3, lambda: signal.pthread_kill(main, signal.SIGINT))
+    timer.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run(settings(weights, (recording.path,), tmp_path / "a.mp4", speed=1.0, start=1e3))
+    finally:
+        timer.cancel()  # else it would come to whatever follows
+    assert time.monotonic() - begun < 30 and not list(tmp_path.glob("*.mp4"))
 
 
 def test_no_events_is_an_error(tmp_path, weights):

@@ -532,6 +532,17 @@ def test_torch_views(saved, new):
 
 @pytest.mark.reference
 @both
+def test_torch_views_that_count_negated_are_refused(tmp_path, new):
+    """The file holds the numbers as they are, and beside them that they are not."""
+    torch = pytest.importorskip("torch", reason="needs PyTorch")
+    path, view = tmp_path / "m.pth", torch._neg_view(torch.ones(3))
+    torch.save({"a": view}, path, _use_new_zipfile_serialization=new)
+    with pytest.raises(CheckpointError, match="m.pth holds a tensor that is a view .*resolve_neg"):
+        read_state_dict(path)
+
+
+@pytest.mark.reference
+@both
 @pytest.mark.parametrize("protocol", [2, 4, 5])
 def test_torch_modules_and_optimisers(tmp_path, new, protocol):
     torch = pytest.importorskip("torch", reason="needs PyTorch")

@@ -135,6 +135,15 @@ def test_normalise_equals_numpy_and_ignores_scale():
         np.testing.assert_allclose(tensor[tensor != 0].std(), 1, atol=1e-4)
 
 
+@pytest.mark.parametrize("kind", [jnp.float16, jnp.bfloat16])
+def test_normalise_of_half_precision_does_not_overflow(kind):
+    """Beyond 65,504 a sum of float16 is infinite, and so is a count."""
+    raw = np.random.default_rng(3).integers(-3, 4, (1, 120, 160, 5)) + 0.5
+    actual = normalise(jnp.asarray(raw, kind))
+    assert actual.dtype == jnp.float32
+    np.testing.assert_allclose(actual[0], references.normalised(raw[0]), atol=1e-5)
+
+
 def test_normalise_of_constant_and_empty_windows_is_zero():
     constant = jnp.zeros((2, 12, 17, 5)).at[0, 3, 3:9, 0].set(2.0)
     assert not np.asarray(normalise(constant)).any()

@@ -383,6 +383,14 @@ def test_a_pause_longer_than_a_video_can_hold_is_cut(tmp_path, name, most, caplo
     assert caplog.text.count("pauses are cut to") == 1
 
 
+def test_pictures_that_are_too_wide_for_an_mp4_are_said_to_be(tmp_path):
+    wide = np.zeros((2, 16_400), np.uint8)
+    with pytest.raises(OutputError, match="a.mp4: pictures of 16400x2 are too large .*: choose"):
+        write_video(tmp_path / "a.mp4", [wide])
+    write_video(tmp_path / "a.gif", [wide])
+    write_video(tmp_path / "b.mp4", [wide[:, :16_384]])
+
+
 def test_what_the_encoder_refuses_is_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setattr("firenet_jax.storage.video.LONGEST_STEP", {".mp4": 2**40})
     writer = open_writer(tmp_path / "a.mp4")

@@ -178,7 +178,8 @@ def test_text_that_is_none_is_named_by_the_page(tmp_path, monkeypatch):
     bad = {
         "more.txt": ("0.1 1 2 1 5\n", "line 1"), "less.txt": ("0.1 1 2 1\n0.2 1 2\n", "line 2"),
         "word.txt": ("0.1 1 2 1\n0.2 1 2 Truth\n", "line 2"), "prose.txt": ("a b c d\n", "line 1"),
-        "gap.csv": ("0.1,1,2,1\n0.2,,2,1\n", "line 2"),
+        "gap.csv": ("0.1,1,2,1\n0.2,,2,1\n", "line 2"), "other.csv": ("0.1;1;2;1\n", "line 1"),
+        "hex.txt": ("1000 1 2 1\n0x9a0 1 2 1\n", "line 2"),
     }  # fmt: skip
     for name, (text, _) in bad.items():
         Path(name).write_text(text)
@@ -195,6 +196,16 @@ def test_columns_that_are_none_are_named_by_the_page(tmp_path, monkeypatch):
         assert found.startswith(f"{name}, event 0: expected t x y p, found"), found
 
 
+def test_sensors_that_cannot_be_are_named_by_the_page(tmp_path, monkeypatch):
+    """Of half a pixel more, votes would be lost."""
+    monkeypatch.chdir(tmp_path)
+    Path("zero.txt").write_text("0 0\n0.1 1 2 1\n")
+    np.savez("half.npz", t=[1], x=[1], y=[2], p=[1], width=20.5, height=15)
+    found = read_by_the_page("zero.txt", "half.npz")
+    assert found["zero.txt"] == "zero.txt: a side of its sensor is 0, expected whole pixels"
+    assert found["half.npz"] == "half.npz: a side of its sensor is 20.5, expected whole pixels"
+
+
 def test_times_that_are_none_are_named_by_the_page(tmp_path, monkeypatch):
     """A window would begin there, and never end."""
     monkeypatch.chdir(tmp_path)
@@ -202,8 +213,9 @@ def test_times_that_are_none_are_named_by_the_page(tmp_path, monkeypatch):
     np.save("b.npy", [[np.nan, 1.0, 2.0, 1.0]])
     np.save("c.npy", np.ones((2, 4), np.float16))
     found = read_by_the_page("a.txt", "b.npy", "c.npy")
-    assert found["a.txt"] == "a.txt, event 1: its time is Infinity"
-    assert found["b.npy"] == "b.npy, event 0: its time is NaN"
+    said = "expected seconds or whole microseconds"
+    assert found["a.txt"] == f"a.txt, event 1: its time is Infinity, {said}"
+    assert found["b.npy"] == f"b.npy, event 0: its time is NaN, {said}"
     assert found["c.npy"] == "c.npy: expected an array of numbers"
 
 

@@ -12,6 +12,7 @@ of the recordings. A damaged recording does not stop the others.
 
 import copy
 import itertools
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -95,6 +96,7 @@ class Outcome:
 
     done: dict[Path, Done] = field(default_factory=dict)
     failed: dict[Path, RecordingError] = field(default_factory=dict)
+    stopped: threading.Event = field(default_factory=threading.Event)  # no more is read
 
 
 @dataclass
@@ -193,7 +195,8 @@ def do_jobs(
     slots = -(-wanted // devices) * devices  # the same number on each device; some may stay empty
     opened: dict[Path, Writer] = {}  # of jobs that are not done
     chunks = ahead(in_chunks(jobs, way, slots, devices, outcome, opened), depth=1)
-    finished = ahead(computed(chunks, jobs[0].recording, way, weights, slots, devices), depth=1)
+    pictures_of = computed(chunks, jobs[0].recording, way, weights, slots, devices)
+    finished = ahead(pictures_of, depth=1, broken=outcome.stopped)
     screen, pictures = Screen() if show else None, 0
     warming = any(job.warm_up for job in jobs)
     try:
@@ -207,6 +210,9 @@ def do_jobs(
             said = "warming up" if warming and not pictures else counted(pictures, "picture")
             progress.set_postfix_str(said, refresh=False)
             progress.update(read.read() - progress.n if read.total else chunk.count)
+    except BaseException:
+        outcome.stopped.set()
+        raise
     finally:
         finished.close()
         if screen:

@@ -110,7 +110,7 @@ def source_of(settings: Live) -> sources.Source:
 def _pieces(source: str):
     if source == "-":
         return sources.standard_input(), False
-    scheme = source.partition("://")[0]
+    scheme = source.partition("://")[0].lower()
     if scheme in ("udp", "tcp"):
         try:
             address = urlsplit(source)
@@ -155,7 +155,7 @@ def run(settings: Live) -> None:
         server = serve(board, figures.summary, source.name, settings.port)
     except OSError as error:
         raise SettingsError(
-            f"port {settings.port} is taken ({error}): pass another --port, or --port 0"
+            f"port {settings.port} cannot be used ({error}): pass another --port, or --port 0"
         ) from error
     address = f"http://127.0.0.1:{server.server_address[1]}/"
     size = f"{source.width}x{source.height}"
@@ -175,6 +175,10 @@ def run(settings: Live) -> None:
             _say(figures)
     except KeyboardInterrupt:
         pass
+    except RecordingError:  # such as of a connection that broke
+        if figures.shown:
+            _conclude(figures, time.monotonic() - begun)
+        raise
     finally:
         shown.close()
         board.end()
@@ -182,12 +186,16 @@ def run(settings: Live) -> None:
             screen.close()
         server.shutdown()
         server.server_close()
+    _conclude(figures, time.monotonic() - begun)
+
+
+def _conclude(figures: Figures, seconds: float) -> None:
     found = figures.summary()
     if sys.stderr.isatty():
         print(file=sys.stderr)
     print(
         f"{counted(found['windows'], 'picture')} of {counted(found['events'], 'event')} in "
-        f"{time.monotonic() - begun:.1f} s, {found['dropped_windows']:,} windows dropped, "
+        f"{seconds:.1f} s, {found['dropped_windows']:,} windows dropped, "
         f"{found['bad_events']:,} events left out"
         + (
             f"; latency {found['latency_ms']} ms, 95 % below {found['latency_95_ms']} ms"

@@ -33,6 +33,7 @@ from firenet_jax.storage import video
 from firenet_jax.storage.arrays import ArraysWriter
 from firenet_jax.storage.bag import BagWriter, check_topic
 from firenet_jax.storage.files import OutputError, check_apart, identity, named
+from firenet_jax.storage.overlap import until_set
 from firenet_jax.storage.progress import Bytes, bar
 from firenet_jax.storage.resume import done_file, is_done, read_position
 from firenet_jax.storage.runs import recorded
@@ -189,7 +190,7 @@ def run(settings: Reconstruct) -> list[Path]:
     process, processes = share(settings.process, settings.processes)
     mine = slice(process, None, processes)
     planned = plan(settings.recordings, settings.output)
-    for path in settings.recordings if len(planned) > 1 else ():  # a slip, not damage: before all
+    for path in settings.recordings:  # a slip, not damage: before all, and before folders are made
         check_exists(path)
     outputs = planned[mine]
     if not outputs:
@@ -293,13 +294,16 @@ def job_of(
     """
     size = parse_size(settings.sensor_size)
     try:
-        recording = open_recording(path, size, settings.strict, settings.columns)
+        whole = open_recording(path, size, settings.strict, settings.columns)
     except RecordingError as error:
         if len(settings.recordings) == 1:
             raise
         logger.warning("%s", error)
         outcome.failed[output] = error
         return None
+    recording = dataclasses.replace(
+        whole, events=lambda: until_set(outcome.stopped, whole.events())
+    )
     windows, speed = windows_for(recording, settings)
     choice = settings.hot_pixels
     hot = functools.cache(lambda: None if choice is None else hot_pixels(choice, recording))

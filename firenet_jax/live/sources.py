@@ -110,27 +110,39 @@ def udp(host: str, port: int) -> Iterator[bytes]:
                 except TimeoutError:
                     yield b""
     except (OSError, ValueError) as error:  # ValueError: no name of a host
-        raise RecordingError(f"udp://{host}:{port}: cannot listen there ({error})") from error
+        where = f"udp://{_in_address(host)}:{port}"
+        raise RecordingError(f"{where}: cannot listen there ({error})") from error
 
 
 def tcp(host: str, port: int) -> Iterator[bytes]:
     """What the program that listens at this address sends, until it ends."""
+    name = f"tcp://{_in_address(host)}:{port}"
     try:
-        with socket.create_connection((host, port), timeout=10) as connection:
-            connection.settimeout(TICK)
-            while True:
-                try:
-                    piece = connection.recv(PIECE)
-                except TimeoutError:
-                    yield b""
-                    continue
-                if not piece:
-                    return
-                yield piece
+        connection = socket.create_connection((host, port), timeout=10)
     except (OSError, ValueError) as error:  # ValueError: no name of a host
         raise RecordingError(
-            f"tcp://{host}:{port}: {error}; start the program that sends events there first"
+            f"{name}: {error}; start the program that sends events there first"
         ) from error
+    with connection:
+        connection.settimeout(TICK)
+        while True:
+            try:
+                piece = connection.recv(PIECE)
+            except TimeoutError:
+                yield b""
+                continue
+            except OSError as error:
+                raise RecordingError(
+                    f"{name}: the connection broke ({error}): start the program there again, and "
+                    "then this one"
+                ) from error
+            if not piece:
+                return
+            yield piece
+
+
+def _in_address(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
 
 
 def standard_input() -> Iterator[bytes]:

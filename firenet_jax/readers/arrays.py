@@ -38,6 +38,8 @@ def recording(
         t, x, y, p = _fields(name, np.asarray(t))
     elif x is None or y is None or p is None:
         raise RecordingError(f"{name}: pass t, x, y and p, or one structured array")
+    if any(map(np.ma.is_masked, (t, x, y, p))):
+        raise RecordingError(f"{name}: some entries are masked: pass the others alone")
     columns = dict(zip("txyp", map(np.asarray, (t, x, y, p)), strict=True))
     if len({column.shape for column in columns.values()}) != 1 or columns["t"].ndim != 1:
         shapes = ", ".join(f"{key} {column.shape}" for key, column in columns.items())

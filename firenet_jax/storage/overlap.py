@@ -7,16 +7,28 @@ HDF5, XLA, zlib), so the stages really run side by side.
 import contextlib
 import queue
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
+from typing import TypeVar
 
+Item = TypeVar("Item")
 _END = object()
 
 
-def ahead(items: Iterator, depth: int = 2) -> Generator:
+def until_set(stop: threading.Event, items: Iterable[Item]) -> Iterator[Item]:
+    """The items, as long as this is not set: who waits for the end of a thread waits for what it is
+    at, which may be to look for the next item among many."""
+    for item in items:
+        if stop.is_set():
+            return
+        yield item
+
+
+def ahead(items: Iterator, depth: int = 2, broken: threading.Event | None = None) -> Generator:
     """Yields what `items` yields, computed by a thread: `depth` items wait, and one is in hand.
 
     An exception of `items` is raised here, in its place among the items. Closing this iterator
-    (or leaving the loop over it) ends the thread and closes `items`.
+    (or leaving the loop over it) ends the thread and closes `items`, which is waited for.
+    broken: set before that by whatever is raised here, such as by Ctrl-C; for `until_set`.
     """
     ready: queue.Queue = queue.Queue(depth)
     stop = threading.Event()
@@ -52,6 +64,10 @@ def ahead(items: Iterator, depth: int = 2) -> Generator:
             if item is _END:
                 return
             yield item
+    except BaseException:
+        if broken is not None:
+            broken.set()
+        raise
     finally:
         stop.set()
         thread.join()

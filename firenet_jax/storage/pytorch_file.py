@@ -341,11 +341,21 @@ def _size(sizes=()) -> tuple:
     return tuple(sizes)
 
 
-def _rebuild_tensor(storage: _Storage, offset, shape, strides, *_) -> _Tensor:
-    return _rebuild_untyped(storage, offset, shape, strides, None, None, storage.type)
+def _rebuild_tensor(storage, offset, shape, strides, *rest) -> _Tensor:
+    """rest: whether it has a gradient, hooks, perhaps metadata."""
+    return _tensor(storage.type, storage, offset, shape, strides, rest[2:])
 
 
-def _rebuild_untyped(storage, offset, shape, strides, _grad, _hooks, type, *_) -> _Tensor:
+def _rebuild_untyped(storage, offset, shape, strides, _grad, _hooks, type, *metadata) -> _Tensor:
+    return _tensor(type, storage, offset, shape, strides, metadata)
+
+
+def _tensor(type, storage, offset, shape, strides, metadata: tuple) -> _Tensor:
+    if any(metadata):
+        raise CheckpointError(
+            "holds a tensor that is a view with a negative or conjugate bit; save "
+            "tensor.resolve_neg().resolve_conj()"
+        )
     whole = isinstance(storage, _Storage) and isinstance(type, _Type) and len(shape) == len(strides)
     shape, strides = _size(shape), _size(strides)
     # Products of numbers of a megabyte would take for ever.

@@ -46,6 +46,7 @@ MP4_CLOCK = 90_000  # ticks per second, as is usual
 LONGEST_STEP = {".mp4": 2**28, ".gif": 2**16 - 1}
 # Of colours, as FFmpeg numbers them (ITU-T H.273): what its conversion from RGB makes, and sRGB.
 SD_MATRIX, LIMITED, REC_709, SRGB = 6, 1, 1, 13
+LONGEST_SIDE = 16_384  # pixels, of x264
 USUAL_RATE = 30  # pictures per second, the encoder's nominal rate without --fps
 PNG_LEVEL = 4  # on grey pictures 25 % faster than the default 6, files 2 % larger
 
@@ -136,8 +137,12 @@ def _strange(folder: Path) -> str | None:
 
 
 def check_free(path: Path) -> None:
-    """Raises OutputError where another run is writing this output."""
-    if partial_name(path).exists():
+    """Raises OutputError where another run is writing this output, or its name is too long."""
+    try:
+        begun = partial_name(path).exists()
+    except OSError as error:
+        raise OutputError(f"{path}: {error.strerror}: choose a shorter output") from error
+    if begun:
         with locked(partial_name(path), path):
             pass
 
@@ -285,6 +290,11 @@ class VideoWriter:
             self.stream.pix_fmt = "pal8"
             self.filter = _palette_filter(height, width, self.tick)
         else:
+            if max(height, width) > LONGEST_SIDE:
+                raise OutputError(
+                    f"{self.path}: pictures of {width}x{height} are too large for an mp4, of which "
+                    f"a side has at most {LONGEST_SIDE} pixels: choose .gif or a folder"
+                )
             self.stream = self.container.add_stream("libx264", rate=self.rate)
             self.stream.pix_fmt = "yuv420p"  # what every player can show
             # With its macroblock tree, x264 makes other bytes of the same pictures now and then.

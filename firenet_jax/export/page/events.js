@@ -168,12 +168,12 @@ function fromColumns(columns, name) {
   for (const key of "txyp")
     if (!columns[key]) throw new Error(`${name}: expected arrays t, x, y and p; ${key} is missing`);
   const scale = columns.t.whole ? 1 : 1e6; // microseconds, or seconds
-  const [width, height] = ["width", "height"].map((side) => Number(columns[side]?.data[0] ?? 0));
+  const [width, height] = ["width", "height"].map((side) => columns[side] && Number(columns[side].data[0]));
   const t = Float64Array.from(columns.t.data, (time) => Math.round(time * scale));
   return checked({ t, x: columns.x.data, y: columns.y.data, p: columns.p.data, width, height }, name);
 }
 
-const words = (line) => line.trim().split(/\s*,\s*|[\s;]+/);
+const words = (line) => line.trim().split(/\s*,\s*|\s+/);
 
 /** A line of names -> [places of t, x, y and p, number of columns, microseconds in the unit of the
  * times or 0]; the unit as in `time [ns]` or `t_us`, of several such the finest. */
@@ -198,10 +198,10 @@ function fromText(bytes, name) {
     throw new Error(`${name}: holds more than ${TEXT / 1e6} MB of text, which a browser cannot: cut it`);
   const lines = new TextDecoder().decode(bytes).split("\n");
   const number = (word) => { // False and True are 0 and 1
-    const value = Number(word || NaN);
+    const value = /^[+-]?0[box]/i.test(word) ? NaN : Number(word || NaN);
     return Number.isNaN(value) && /^(false|true)$/i.test(word) ? Number(word.length === 4) : value;
   };
-  let [first, width, height, order, columns, unit, geometry] = [0, 0, 0, [0, 1, 2, 3], 4, 0];
+  let [first, width, height, order, columns, unit, geometry] = [0, undefined, undefined, [0, 1, 2, 3], 4, 0];
   for (; first < lines.length; first++) {
     const found = words(lines[first]);
     const named = namesOf(lines[first]);
@@ -235,9 +235,13 @@ function checked({ t, x, y, p, width, height }, name) {
   const count = t.length;
   if (!count || [x, y, p].some((c) => c.length !== count))
     throw new Error(`${name}: holds no events, or columns of different lengths`);
+  for (const side of [width, height])
+    if (side !== undefined && !(side >= 1 && side <= 32768 && side % 1 === 0))
+      throw new Error(`${name}: a side of its sensor is ${side}, expected whole pixels`);
   let [right, bottom] = [0, 0];
   for (let n = 0; n < count; n++) {
-    if (!Number.isFinite(t[n])) throw new Error(`${name}, event ${n}: its time is ${t[n]}`);
+    if (!(Math.abs(t[n]) < 2 ** 53))
+      throw new Error(`${name}, event ${n}: its time is ${t[n]}, expected seconds or whole microseconds`);
     if (n && t[n] < t[n - 1]) throw new Error(`${name}, event ${n}: its time goes back`);
     if (!(x[n] >= 0 && y[n] >= 0 && x[n] < 32768 && y[n] < 32768))
       throw new Error(`${name}, event ${n}: outside of any sensor`);
@@ -246,7 +250,7 @@ function checked({ t, x, y, p, width, height }, name) {
     right = Math.max(right, x[n]);
     bottom = Math.max(bottom, y[n]);
   }
-  [width, height] = [width || right + 1, height || bottom + 1];
+  [width, height] = [width ?? right + 1, height ?? bottom + 1];
   if (right >= width || bottom >= height)
     throw new Error(`${name}: an event lies outside of the sensor of ${width}x${height}`);
   return {
