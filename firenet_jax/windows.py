@@ -145,7 +145,7 @@ def cut(
         if len(times) < 2:
             raise RecordingError(
                 f"{recording.path}: windows between frames need a recording with two frames or "
-                "more, each at a time of its own: use --events-per-pixel or --duration"
+                "more, each at a time of its own: use --events or --duration"
             )
         spans = partial(_frame_spans, recording.path, times)
         return _by_time(recording.path, chunks, begin, spans)
@@ -242,7 +242,7 @@ def _by_time(path, chunks: Iterator[Events], begin: int | None, spans) -> Iterat
         if held.t[b] - stop > MAX_GAP:  # a broken time: there may be billions of windows up to it
             raise RecordingError(
                 f"{path}: no event from {stop / 1e6:.6f} to {held.t[b] / 1e6:.6f} s, more than an "
-                "hour: leave one side out with --start or --stop, or use --events-per-pixel"
+                "hour: leave one side out with --start or --stop, or use --events"
             )
         held = held.select(slice(a, None))
 
@@ -270,8 +270,8 @@ def _frame_spans(path, times: np.ndarray, first: int) -> Iterator[tuple[int, int
     if max(times[0] - first, first - times[-1]) > MAX_GAP:
         raise RecordingError(
             f"{path}: its frames are from {times[0] / 1e6:.6f} to {times[-1] / 1e6:.6f} s, its "
-            f"events begin at {first / 1e6:.6f} s: they are not on one clock; use "
-            "--events-per-pixel or --duration"
+            f"events begin at {first / 1e6:.6f} s: they are not on one clock; use --events or "
+            "--duration"
         )
     interval = max(1, int(np.median(np.diff(times))))
     missing = max(0, (int(times[0]) - first) // interval)

@@ -506,6 +506,23 @@ def test_clips_of_common_formats_reach_from_black_to_white(tmp_path, suffix):
     assert np.diff([p.time for p in read]) == pytest.approx(1e5)
 
 
+@pytest.mark.parametrize("codec, options", [("libx264", {}), ("mpeg4", {"bf": "2"})])
+def test_pictures_of_an_avi_come_in_the_order_in_which_they_are_shown(tmp_path, codec, options):
+    """They are stored in another one, and it says no other times."""
+    clip, levels = tmp_path / "a.avi", 10 * np.arange(20) + 20
+    with av.open(str(clip), "w") as container:
+        stream = container.add_stream(codec, rate=50, options=options)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.bit_rate = 4_000_000
+        for level in levels:
+            picture = np.full((48, 64), level, np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="gray")))
+        container.mux(stream.encode(None))
+    read = list(read_clip(clip))
+    assert [picture.time for picture in read] == list(range(0, 400_000, 20_000))
+    np.testing.assert_allclose([picture.image.mean() for picture in read], levels, atol=6)
+
+
 @pytest.mark.parametrize(
     "matrix, shown",
     [
@@ -602,6 +619,7 @@ def test_everything_wrong_is_one_sentence(tmp_path, monkeypatch, capsys):
         ("-o new --seconds 0", "seconds is 0.0"),
         ("-o new --seconds 3600", "make more sequences"),
         ("-o new --fps 0", "fps is 0.0"),
+        ("-o new --seconds 0.1 --fps 3", "is a single image"),
         ("-o new --sequences 0", "sequences is 0"),
         ("-o new --validation 2000", "validation is 2000"),
         ("-o new --sensor-size big", "sensor size 'big'"),

@@ -314,8 +314,10 @@ def test_flow_of_frames_that_are_not_in_a_row_is_no_flow_that_is_missing(folder,
     ours = settings(
         folder, tmp_path / "out", data=(folder / "data" / "a.h5",), methods="hf", keep_ratio=0.4
     )
-    (sequence,) = run(ours)["sequences"].values()
-    assert sequence["methods"]["hf"]["gaps"]["temporal_error"] == "no two frames in a row"
+    for ratio in (0.4, 0.2):  # of one frame, there is no flow to be seen
+        chosen = dataclasses.replace(ours, output=tmp_path / f"{ratio}", keep_ratio=ratio)
+        (sequence,) = run(chosen)["sequences"].values()
+        assert sequence["methods"]["hf"]["gaps"]["temporal_error"] == "no two frames in a row"
 
 
 def test_numbers_of_an_earlier_run_that_are_not_whole_are_named(folder, tmp_path):
@@ -663,6 +665,7 @@ def test_gaps_have_names_and_the_rest_is_measured(folder, tmp_path, capsys):
     write(data / "later.h5", 6, whole, begin=10**9)
     write(data / "earlier.h5", 6, Events(whole.t + 10**9, whole.x, whole.y, whole.p))
     write(data / "noframes.h5", 0)
+    write(data / "oneframe.h5", 1)
     write(data / "silent.h5", 6, Events.empty())
     write(data / "good.h5", 6)
     results = run(settings(folder, tmp_path / "out", data=(data,), weights=(), methods="hf,e2vid",
@@ -671,6 +674,7 @@ def test_gaps_have_names_and_the_rest_is_measured(folder, tmp_path, capsys):
     assert all(entry["e2vid"]["gap"] for entry in found.values())
     assert found["data-good"]["e2vid"]["gap"] == "no weights"
     assert found["data-noframes"]["hf"]["gap"] == "no frames"
+    assert found["data-oneframe"]["hf"]["gap"] == "fewer than two frames"
     assert found["data-silent"]["hf"]["gap"] == "no events"
     for name in ("later", "earlier"):
         assert found[f"data-{name}"]["hf"]["gap"].startswith("no overlap in time: frames")
@@ -770,6 +774,28 @@ def test_pixels_whose_flow_is_not_known_do_not_count(folder, tmp_path):
     np.testing.assert_array_equal(a == b, numbers != 3)
 
 
+def test_an_error_over_no_pixels_is_none_at_all(folder, tmp_path):
+    """And not 0, which would be perfect."""
+    write(tmp_path / "some" / "a.h5", 6)
+    with h5py.File(tmp_path / "some" / "a.h5", "r+") as file:
+        file["flow/flow000000003"][:] = np.nan
+    (found,) = run(settings(folder, tmp_path / "out", data=(tmp_path / "some",), methods="hf"))[
+        "sequences"
+    ].values()
+    found = found["methods"]["hf"]
+    missing = [value is None for value in found["values"]["temporal_error"]]
+    assert missing == [
+        number in (found["frame_numbers"][0], 3) for number in found["frame_numbers"]
+    ]
+    with h5py.File(tmp_path / "some" / "a.h5", "r+") as file:
+        for flow in file["flow"].values():
+            flow[:] = np.nan
+    (found,) = run(settings(folder, tmp_path / "none", data=(tmp_path / "some",), methods="hf"))[
+        "sequences"
+    ].values()
+    assert found["methods"]["hf"]["gaps"]["temporal_error"] == "no flow"
+
+
 def test_frames_of_another_size_and_nothing_at_all(folder, tmp_path):
     ours = settings(folder, tmp_path / "out", methods="hf", sensor_size="30x20")
     with pytest.raises(ValueError, match="frames are 28x20, the sensor is 30x20"):
@@ -778,8 +804,11 @@ def test_frames_of_another_size_and_nothing_at_all(folder, tmp_path):
     with pytest.raises(ValueError, match="holds no recordings"):
         run(settings(folder, tmp_path / "out", data=(tmp_path / "empty",)))
     twice = (folder / "data" / "a.h5", folder / "data" / "a.h5")
-    with pytest.raises(ValueError, match="both named a"):
+    with pytest.raises(ValueError, match="are the same recording: name it once"):
         run(settings(folder, tmp_path / "out", data=twice))
+    (tmp_path / "a.h5").write_bytes(twice[0].read_bytes())
+    with pytest.raises(ValueError, match="both named a: rename one of them"):
+        run(settings(folder, tmp_path / "out", data=(twice[0], tmp_path / "a.h5")))
 
 
 def test_runs_are_named_by_all_of_their_folders_names(tmp_path):

@@ -272,3 +272,12 @@ def test_some_sequences_may_be_warm_and_others_not():
     ]
     assert batch > 1 and not np.isclose(alone[0], alone[1])
     np.testing.assert_allclose(loss, np.mean(alone), rtol=1e-5)
+
+
+def test_the_temporal_term_is_a_mean_over_the_images_that_count_though_few_do():
+    """Of two images of each of two sequences, one of them warm, half an image counts."""
+    arguments, settings = sequence(2), replace(NOTHING, lambda_tc=1.5, l0=2, L=4)
+    warm = np.arange(arguments[0].shape[1]) == 0
+    _, found = sequence_loss(*arguments, settings, jnp.asarray(warm))
+    _, alone = sequence_loss(*(each[:, :1] for each in arguments), settings, True)
+    np.testing.assert_allclose(found["temporal"], alone["temporal"], rtol=1e-5)

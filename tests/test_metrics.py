@@ -368,6 +368,13 @@ def test_wrong_sizes_are_refused():
         metrics.ssim(np.zeros((10, 30)), np.zeros((10, 30)))
     with pytest.raises(ValueError, match="MS-SSIM needs"):
         metrics.ms_ssim(np.zeros((10, 30)), np.zeros((10, 30)))
+    for function, least in ((metrics.cw_ssim, 17), (metrics.random_features, 8)):
+        assert np.isfinite(function(np.zeros((least, 30)), np.ones((least, 30))))
+        small = np.zeros((least - 1, 30))
+        with pytest.raises(
+            ValueError, match=f"{least}x{least} pixels at least, not 30x{least - 1}"
+        ):
+            function(small, small)
 
 
 def shifted(picture, pixels):

@@ -136,3 +136,8 @@ def test_a_damaged_tiff_is_not_used(tmp_path, caplog):
     (tmp_path / "bad.tif").write_bytes(data)
     assert load_textures(tmp_path, count=3, size=64).shape == (3, 64, 64)
     assert f"not used: {tmp_path / 'bad.tif'}" in caplog.text
+
+
+def test_small_textures_hold_every_kind_of_drawing():
+    for size in (16, 23):
+        assert load_textures(None, 12, size, procedural=1.0).shape == (12, size, size)

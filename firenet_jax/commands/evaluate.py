@@ -245,13 +245,13 @@ def find_sequences(paths: tuple[Path, ...]) -> dict[str, Path]:
             if recording.is_file():
                 parts[-1] = Path(parts[-1]).stem
             name = "-".join(parts)
-            if name in found:
-                raise RecordingError(
-                    f"{found[name]} and {recording} are both named {name}: rename one of them"
-                )
             if (first := places.setdefault(recording.resolve(), recording)) is not recording:
                 raise RecordingError(
                     f"{first} and {recording} are the same recording: name it once"
+                )
+            if name in found:
+                raise RecordingError(
+                    f"{found[name]} and {recording} are both named {name}: rename one of them"
                 )
             found[name] = recording
     return found

@@ -143,6 +143,11 @@ class Simulate:
                 )
         else:
             check_none_idle(self, ["overwrite"], "simulating scenes, where an earlier run goes on")
+            if self.seconds * self.fps < 1:
+                raise SettingsError(
+                    f"{self.seconds:g} s at {self.fps:g} images per second is a single image, of "
+                    "no use in training and evaluation: ask for more --seconds or --fps"
+                )
 
 
 # ---- Sequences

@@ -29,6 +29,13 @@ class Gap(Exception):
     """Why a metric is missing, in a few words for a table."""
 
 
+def velocity(frames: Frames, number: int) -> np.ndarray | None:
+    """(2, H, W) optical flow up to a frame, pixels per second; None where the recording has none,
+    or it is nowhere known: an error over no pixels would be none at all."""
+    found = None if frames.flow is None else frames.flow(number)
+    return found if found is not None and np.isfinite(found).any() else None
+
+
 class Plan(NamedTuple):
     """Which part of a recording is reconstructed, and which frames count."""
 
@@ -110,7 +117,6 @@ class Measurements:
         self.no_lpips = "no weights" if learned is None else "pictures too small"
         self.places: list[int] = []
         self.values = {name: [] for name in METRICS if name != "lpips" or self.learned}
-        self.flow = False  # whether any frame had it
         self.last: tuple[int, np.ndarray, np.ndarray] | None = None  # place, image, truth
 
     def add(self, batch: list[Comparison]) -> tuple[np.ndarray, np.ndarray]:
@@ -129,7 +135,6 @@ class Measurements:
         if self.learned:
             distances = lpips.lpips(self.learned, *map(_whole, compared))
             self.values["lpips"] += distances[:count].tolist()
-        self.flow |= any(entry.flow is not None for entry in batch)
         self.values["temporal_error"] += self._temporal(batch, images, truths)
         self.places += places
         return compared
@@ -165,7 +170,9 @@ class Measurements:
                 place = self.places[good.index(False)]
                 gaps[name] = f"infinite at frame {self.plan.numbers[place] + 1}"
             elif all(value is None for value in series):
-                gaps[name] = "no two frames in a row" if self.flow else "no flow"
+                flows = (velocity(self.plan.frames, int(n)) for n in self.plan.numbers)
+                known = any(flow is not None for flow in flows)
+                gaps[name] = "no two frames in a row" if known else "no flow"
             values[name] = [v if ok else None for v, ok in zip(series, good, strict=True)]
         if not self.learned:
             gaps["lpips"] = self.no_lpips

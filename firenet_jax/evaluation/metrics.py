@@ -203,6 +203,13 @@ def ms_ssim_scales(height: int, width: int) -> int:
     return sum(min(height, width) >> scale >= WINDOW for scale in range(len(SCALES)))
 
 
+def _check_sides(image: jax.Array, least: int, needs: str) -> None:
+    """Raises SettingsError for an image with a side of fewer pixels."""
+    height, width = image.shape[-2:]
+    if min(height, width) < least:
+        raise SettingsError(f"{needs} {least}x{least} pixels at least, not {width}x{height}")
+
+
 @_measure
 def ms_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     """Multi-scale SSIM (Wang, Simoncelli, Bovik 2003), 0 to 1; sees a negative (it becomes 0).
@@ -214,10 +221,7 @@ def ms_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     another term as well.
     """
     scales = ms_ssim_scales(*image.shape[-2:])
-    if scales == 0:
-        raise SettingsError(
-            f"MS-SSIM needs {WINDOW}x{WINDOW} pixels at least, not {image.shape[-2:]}"
-        )
+    _check_sides(image, WINDOW, "MS-SSIM needs")
     weights = np.array(SCALES[:scales]) / sum(SCALES[:scales])
     product = jnp.ones(image.shape[:-2])
     for scale, weight in enumerate(weights.tolist()):
@@ -443,6 +447,7 @@ def cw_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     The original has a steerable pyramid.
     Tolerates shifts of a pixel or two. Blind to a negative and to offsets.
     """
+    _check_sides(image, 17, "CW-SSIM needs")
     scales = max(1, sum(min(image.shape[-2:]) >> scale >= 17 for scale in range(3)))
     similarity = jnp.float32(0)
     for scale in range(scales):
@@ -496,6 +501,7 @@ def random_features(image: jax.Array, truth: jax.Array) -> jax.Array:
     convolution and ReLU (16, 32, 64 channels, He normal weights); the first halving turns 2x2
     pixels into 4 channels, the others take means. Liu et al. 2021 train with such features.
     """
+    _check_sides(image, 8, "random features need")
     kernels = random_kernels(seed=0)
     both = (_random_layers(kernels, picture) for picture in (image, truth))
     layers = [_mean(((a - b) ** 2).sum(-1)) for a, b in zip(*both, strict=True)]

@@ -30,6 +30,7 @@ from firenet_jax.evaluation.comparison import (
     Pictures,
     Plan,
     matched,
+    velocity,
 )
 from firenet_jax.evaluation.equalise import Kind
 from firenet_jax.evaluation.methods import Method, look
@@ -137,7 +138,7 @@ def plan(name: str, recording: Recording, protocol: Protocol) -> Plan:
     """
     frames = recording.frames
     if frames is None or len(frames.times) < 2:
-        raise Gap("no frames")
+        raise Gap("no frames" if frames is None else "fewer than two frames")
     if frames.damage is not None:  # those after it would be left out of the means
         raise Gap(f"its frames end where it is damaged: {frames.damage}")
     height, width = frames.read(0).shape
@@ -242,16 +243,16 @@ def until(latest: int, entries: Iterator[Window | Step]) -> Iterator[Window | St
 
 
 def displacement(plan: Plan, place: int) -> np.ndarray | None:
-    """(H, W, 2) pixels since the frame before, where the recording has flow and the frame before
-    is used too."""
-    flow, number = plan.frames.flow, int(plan.numbers[place])
-    if flow is None or place == 0 or number != plan.numbers[place - 1] + 1:
+    """(H, W, 2) pixels since the frame before, where flow is known and the frame before is used
+    too."""
+    number = int(plan.numbers[place])
+    if place == 0 or number != plan.numbers[place - 1] + 1:
         return None
-    velocity = flow(number)
-    if velocity is None:
+    flow = velocity(plan.frames, number)
+    if flow is None:
         return None
     seconds = np.float32(1e-6 * (plan.times[place] - plan.times[place - 1]))
-    return seconds * np.moveaxis(velocity.astype(np.float32), 0, -1)
+    return seconds * np.moveaxis(flow.astype(np.float32), 0, -1)
 
 
 def evaluate(
@@ -282,7 +283,8 @@ def evaluate(
             if plan.first <= place < plan.last:
                 truth = plan.frames.read(int(plan.numbers[place]))
                 if truth.shape != image.shape:
-                    raise Gap(f"frame {plan.numbers[place] + 1} is of another size: {truth.shape}")
+                    size, sensor = (f"{w}x{h}" for h, w in (truth.shape, image.shape))
+                    raise Gap(f"frame {plan.numbers[place] + 1} is {size}, the sensor is {sensor}")
                 waiting.append(Comparison(place, image, truth, displacement(plan, place)))
             if len(waiting) == IMAGES_AT_ONCE:
                 pictures.add(waiting, found.add(waiting))

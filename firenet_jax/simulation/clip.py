@@ -32,8 +32,10 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             period = 1 / (stream.average_rate or Fraction(25))
+            # An .avi says in which order pictures are stored, not when they are shown.
+            stored = container.format.name == "avi" and stream.codec_context.has_b_frames
             for number, frame in enumerate(container.decode(stream)):
-                if frame.pts is None or frame.time_base is None:
+                if frame.pts is None or frame.time_base is None or stored:
                     seconds = number * period
                 else:
                     seconds = frame.pts * frame.time_base
@@ -47,8 +49,8 @@ def read_clip(path: Path, size: tuple[int, int] | None = None) -> Iterator[Pictu
                     )
                 last = time
                 matrix = _matrix(frame)
-                stored = size[::-1] if size and _lies(matrix) else size  # before it is turned
-                height, width = stored or (frame.height, frame.width)
+                lying = size[::-1] if size and _lies(matrix) else size  # before it is turned
+                height, width = lying or (frame.height, frame.width)
                 # By way of RGB: the grey plane of a video does not reach from 0 to 255.
                 rgb = frame.to_ndarray(format="rgb24", width=width, height=height)
                 grey = rgb @ np.array([0.299, 0.587, 0.114], np.float32)

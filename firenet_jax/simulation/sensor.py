@@ -217,6 +217,7 @@ class SensorState(NamedTuple):
     """The state of the pixels between two renderings."""
 
     log: jax.Array  # (H, W) float32, L after the low-pass
+    seen: jax.Array | None  # (H, W) float32, L before it; None where there is none
     above: jax.Array  # (H, W) float32, L above the reference: small, so no rounding adds up
     silent: jax.Array | None  # (H, W) int32, ticks until the refractory period is over
     noise_on: jax.Array | None  # (H, W) bool, whether the next noise event is ON
@@ -347,7 +348,8 @@ def first_state(sensor: Sensor, image: jax.Array) -> SensorState:
     noise_on = None
     if sensor.noise is not None and sensor.phase is not None:
         noise_on = sensor.phase * 1024 % 2 < 1
-    return SensorState(log, above, silent, noise_on, cycles, jnp.int32(0))
+    seen = None if sensor.cutoff is None else log
+    return SensorState(log, seen, above, silent, noise_on, cycles, jnp.int32(0))
 
 
 def _lit(lamp: Lamp | None, cycles: jax.Array | None, image: jax.Array) -> jax.Array:
@@ -370,13 +372,13 @@ def step(
     if sensor.lamp is not None and cycles is not None:
         cycles = (cycles + seconds * sensor.lamp.hertz) % 1
     lit = _lit(sensor.lamp, cycles, image)
-    before, after = state.log, log_intensity(lit)
-    if sensor.cutoff is not None:
-        cutoff, dark = sensor.cutoff
-        rate = 2 * jnp.pi * cutoff * (dark + (1 - dark) * lit)
-        after = before - jnp.expm1(-seconds * rate) * (after - before)
+    log, seen = log_intensity(lit), None
+    rise = log - state.log
+    if sensor.cutoff is not None and state.seen is not None:
+        seen = log
+        rise = _low_pass(sensor.cutoff, state.seen, state.log, lit, seconds)
+        log = state.log + rise
 
-    rise = after - before
     if sensor.drift is not None:
         rise = rise + seconds * sensor.drift  # relative to a sinking reference, L rises
 
@@ -414,7 +416,20 @@ def step(
         noise = _shot_noise(bits, expected, jnp.where(noise_on, 1.0, -1.0), ticks)
         noise_on = noise_on ^ (noise.count > 0)
         runs += (noise,)
-    return SensorState(after, above, silent, noise_on, cycles, state.renderings + 1), runs
+    return SensorState(log, seen, above, silent, noise_on, cycles, state.renderings + 1), runs
+
+
+def _low_pass(cutoff, seen: jax.Array, log: jax.Array, lit: jax.Array, seconds) -> jax.Array:
+    """By how much what comes of L by a low-pass of first order rises.
+
+    Exactly that of an L which is linear between two renderings, so that it does not matter how many
+    there are; only that a pixel is as fast as at the end, the brighter the faster.
+    """
+    hertz, dark = cutoff
+    a = seconds * 2 * jnp.pi * hertz * (dark + (1 - dark) * lit)
+    reached = -jnp.expm1(-a)  # of where L was at the beginning
+    lag = reached / jnp.maximum(a, 1e-12)  # of what it rises by: an a-th of that in the long run
+    return (1 - lag) * (log_intensity(lit) - seen) + reached * (seen - log)
 
 
 def _refractory(run: Run, silent: jax.Array, refractory: jax.Array, ticks: jax.Array):

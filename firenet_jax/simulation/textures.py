@@ -166,7 +166,7 @@ def gratings(rng, size: int) -> np.ndarray:
     values = np.zeros((size, size))
     for _ in range(rng.integers(1, 4)):
         angle, phase = rng.uniform(0, 2 * np.pi, 2)
-        wave = 2 * np.pi / np.exp(rng.uniform(np.log(6), np.log(size / 4)))
+        wave = 2 * np.pi / np.exp(rng.uniform(np.log(6), np.log(max(size / 4, 6))))
         values += np.sin(wave * (np.cos(angle) * x + np.sin(angle) * y) + phase)
     if rng.random() < 0.5:  # edges two pixels wide
         values = np.tanh(values * size / 64)

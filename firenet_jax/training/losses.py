@@ -154,5 +154,6 @@ def sequence_loss(
             counted = jnp.where(warm, True, jnp.broadcast_to(late, errors.shape)).astype(float)
         total = (counted * errors).sum(0).mean()
         loss += settings.lambda_tc * total
-        terms["temporal"] = total / jnp.maximum(mean(counted.sum(0).mean()), 1)
+        number = mean(counted.sum(0).mean())  # of a sequence's images, which may be less than one
+        terms["temporal"] = total / jnp.where(number > 0, number, 1.0)
     return loss, {name: term.mean() for name, term in terms.items()}
