@@ -185,8 +185,9 @@ def _unfinished(folder: Path, found: dict[str, Path]) -> None:
     writer.holding.close()
     keep_position(output, {"seed": 0}, 3, 3, state0=np.zeros((4, 5), np.float32))
     publish_position(output, 3)
-    output.with_name("video.gif").write_bytes(b"whole")
-    mark_done(output.with_name("video.gif"), {"seed": 0})
+    video = output.with_name("video.gif")
+    video.write_bytes(b"whole")
+    mark_done(video, {"seed": 0}, video)
     with ocp.CheckpointManager(folder / "checkpoint") as saved:
         saved.save(3, args=ocp.args.StandardSave(STATE))
     found |= {"unfinished": output.parent, "checkpoint": folder / "checkpoint"}

@@ -29,8 +29,9 @@ from firenet_jax.network import Weights, initial_params
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
 from firenet_jax.reconstruction import Network
+from firenet_jax.storage.arrays import ArraysWriter
 from firenet_jax.storage.files import OutputError, locked, read_arrays
-from firenet_jax.storage.video import FolderWriter
+from firenet_jax.storage.video import FolderWriter, VideoWriter
 from firenet_jax.windows import Windows
 
 HEIGHT, WIDTH = 20, 24
@@ -410,6 +411,32 @@ def test_an_interrupted_run_of_several_goes_on(tmp_path, weights, monkeypatch, c
     for name in "abc":
         np.testing.assert_array_equal(pictures_of(tmp_path / "out" / name)[0], expected)
     assert {path.name for path in (tmp_path / "out").iterdir()} == set("abc")
+
+
+@pytest.mark.parametrize("name", ["out", "out.mp4", "out.h5"])
+@pytest.mark.parametrize("moment", ["noted", "named"])
+def test_a_run_that_ends_as_an_output_gets_its_name_goes_on(
+    tmp_path, weights, monkeypatch, name, moment
+):
+    paths = tuple(write_recording(tmp_path / f"{n}.txt", 900, seed=3) for n in "ab")
+    kind = {"out": FolderWriter, "out.mp4": VideoWriter, "out.h5": ArraysWriter}[name]
+    finished = kind.finish
+
+    def killed(self, noted):
+        def and_no_more(made):
+            noted(made)
+            raise Interrupted
+
+        finished(self, and_no_more if moment == "noted" else noted)
+        raise Interrupted
+
+    monkeypatch.setattr(kind, "finish", killed)
+    with pytest.raises(Interrupted):
+        run(settings(weights, paths, tmp_path / name, batch=1))
+    monkeypatch.undo()
+    run(settings(weights, paths, tmp_path / name, batch=1))
+    ends = Path(name).suffix
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {f"a{ends}", f"b{ends}"}
 
 
 def test_what_is_no_longer_what_an_interrupted_run_left_is_not_taken_for_done(tmp_path, weights):

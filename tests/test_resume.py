@@ -51,7 +51,7 @@ def test_an_output_is_done_while_it_and_its_settings_are_the_same(tmp_path):
     output = tmp_path / "a.mp4"
     output.write_bytes(b"video")
     assert not resume.is_done(output, RECORD)
-    resume.mark_done(output, RECORD)
+    resume.mark_done(output, RECORD, output)
     assert resume.is_done(output, RECORD) and not resume.is_done(output, OTHER)
     output.write_bytes(b"other video")
     assert not resume.is_done(output, RECORD)

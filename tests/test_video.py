@@ -239,6 +239,31 @@ def test_what_is_not_ours_beside_an_output_stays(tmp_path):
     assert len(list((tmp_path / "out").iterdir())) == 3
 
 
+@pytest.mark.parametrize("killed_at", [1, 2])
+def test_a_folder_is_not_lost_to_a_run_that_is_killed_while_it_replaces_it(
+    tmp_path, monkeypatch, killed_at
+):
+    write_video(tmp_path / "out", ramp(4))
+    rename, calls = Path.rename, []
+
+    def killed(self, target):
+        calls.append(target)
+        if len(calls) == killed_at:
+            raise KeyboardInterrupt
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / "out", ramp(2))
+    monkeypatch.undo()
+    writer = open_writer(tmp_path / "out")
+    assert len(list((tmp_path / "out").glob("*.png"))) == 4  # whole, and back where it was
+    writer.abandon()
+    write_video(tmp_path / "out", ramp(3))
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert len(list((tmp_path / "out").glob("*.png"))) == 3
+
+
 def test_replacing_a_folder_minds_what_lies_beside_it(tmp_path):
     (tmp_path / "out.old").mkdir()
     (tmp_path / "out.old" / "mine.txt").write_text("")

@@ -17,6 +17,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,7 +42,7 @@ from firenet_jax.reconstruction import (
 from firenet_jax.storage import resume
 from firenet_jax.storage.arrays import ArraysWriter
 from firenet_jax.storage.bag import BagWriter
-from firenet_jax.storage.files import OutputError
+from firenet_jax.storage.files import OutputError, no_note
 from firenet_jax.storage.overlap import ahead
 from firenet_jax.storage.progress import Bytes
 from firenet_jax.storage.screen import Screen
@@ -444,10 +445,7 @@ def finish(running: Running, way: Way, outcome: Outcome) -> None:
         writer.abandon()
         return
     resume.done_file(output).unlink(missing_ok=True)
-    writer.finish()
-    if isinstance(writer, FolderWriter):
-        (output / "resume.npz").unlink(missing_ok=True)
-    if way.several:
-        resume.mark_done(output, running.job.record)
+    noted = partial(resume.mark_done, output, running.job.record)
+    writer.finish(noted if way.several else no_note)
     slower = writer.slower if isinstance(writer, VideoWriter) else None
     outcome.done[output] = Done(running.job, running.written, running.events, slower)

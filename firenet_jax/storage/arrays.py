@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 from firenet_jax.storage.disk import Disk
-from firenet_jax.storage.files import open_alone, partial_name, writing
+from firenet_jax.storage.files import Noted, no_note, open_alone, partial_name, writing
 
 
 class ArraysWriter:
@@ -52,10 +52,11 @@ class ArraysWriter:
             self.disk.check()
         self.count += 1
 
-    def finish(self) -> None:
+    def finish(self, noted: Noted = no_note) -> None:
         with writing(self.path):
             self.file.close()
             self.disk.check()
+            noted(self.partial)
             if os.name == "nt":  # an open file cannot be renamed there
                 self.held.close()
             self.partial.replace(self.path)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from firenet_jax.errors import OutputError, RecordingError, SettingsError
-from firenet_jax.storage.files import lock, locked, partial_name, writing
+from firenet_jax.storage.files import Noted, lock, locked, no_note, partial_name, writing
 
 IMAGE, HEADER, TIME = (
     "sensor_msgs/msg/Image", "std_msgs/msg/Header", "builtin_interfaces/msg/Time",
@@ -96,11 +96,12 @@ class BagWriter:
             bag.write(self.connection, 1000 * time, serialise(message, IMAGE))
         self.count += 1
 
-    def finish(self) -> None:
+    def finish(self, noted: Noted = no_note) -> None:
         with _writing(self.path):
             self.bag.close()
             if self.ros2:  # the database in it is named after the partial folder
                 _rename_inside(self.partial, self.path.name)
+            noted(self.partial)
             _remove(self.path, self.path)
             self.partial.rename(self.path)
             self.holding.close()

@@ -8,7 +8,7 @@ import contextlib
 import io
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,13 @@ def partial_name(path: Path) -> Path:
             "recordings: a recording) of another name"
         )
     return path.with_name(f"{path.stem}.partial{path.suffix}")
+
+
+Noted = Callable[[Path], None]
+
+
+def no_note(made: Path) -> None:
+    """What writers call by default with what they have made, whole, before it gets its name."""
 
 
 def identity(path: Path) -> list:

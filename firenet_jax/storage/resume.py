@@ -25,21 +25,24 @@ def done_file(output: Path) -> Path:
     return output.with_name(f"{output.name}.done.json")
 
 
-def mark_done(output: Path, record: dict) -> None:
-    """Notes beside an output that it is whole, though others of the same run are not."""
-    write_text(done_file(output), _note(output, record))
+def mark_done(output: Path, record: dict, made: Path) -> None:
+    """Notes beside an output that it is whole, though others of the same run are not.
+
+    made: where it is whole, before it is renamed: who is killed in between has lost neither."""
+    write_text(done_file(output), _note(output, record, made))
 
 
 def is_done(output: Path, record: dict) -> bool:
     """Whether an interrupted run of the same settings completed this output, unchanged since."""
     try:
-        return done_file(output).read_text() == _note(output, record)
+        return done_file(output).read_text() == _note(output, record, output)
     except (OSError, UnicodeDecodeError):
         return False
 
 
-def _note(output: Path, record: dict) -> str:
-    return json.dumps([record, identity(output)])
+def _note(output: Path, record: dict, made: Path) -> str:
+    _, *state = identity(made)
+    return json.dumps([record, [output.name, *state]])
 
 
 # ---- Positions in a folder of pictures

@@ -9,7 +9,6 @@ import itertools
 import os
 import re
 import shutil
-import tempfile
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
@@ -23,7 +22,7 @@ from PIL import Image
 
 from firenet_jax.errors import OutputError, RecordingError, logger
 from firenet_jax.storage import bag
-from firenet_jax.storage.files import locked, open_alone, partial_name, writing
+from firenet_jax.storage.files import Noted, locked, no_note, open_alone, partial_name, writing
 from firenet_jax.storage.runs import make_folder
 
 VIDEOS = (".mp4", ".gif")
@@ -162,6 +161,7 @@ class FolderWriter:
 
     def __init__(self, path: Path, at_times: bool = False, in_nanoseconds: bool = False):
         self.path, self.partial = path, partial_name(path)
+        self.replaced = path.with_name(f"{path.name}.replaced.partial")  # no output is named so
         self.at_times, self.in_nanoseconds = at_times, in_nanoseconds
         self.count = 0
         self.stamps: TextIO | None = None
@@ -169,6 +169,12 @@ class FolderWriter:
         with writing(path):
             self.partial.mkdir(exist_ok=True)
             self.holding.enter_context(locked(self.partial, path))
+            # Of a run that was killed while it replaced a folder.
+            if self.replaced.exists() and not _strange(self.replaced):
+                if path.exists():
+                    shutil.rmtree(self.replaced)
+                else:
+                    self.replaced.rename(path)
 
     def keep(self, done: int) -> TextIO:
         """Goes on after so many pictures of an earlier run; what lies beyond is written again."""
@@ -218,7 +224,7 @@ class FolderWriter:
         with (self.partial / "timestamps.txt").open() as stamps:
             return {self._name(int(line.split()[1])) for line in itertools.islice(stamps, 1, None)}
 
-    def finish(self) -> None:
+    def finish(self, noted: Noted = no_note) -> None:
         with writing(self.path):
             if self.stamps is not None:
                 self.stamps.close()
@@ -226,16 +232,18 @@ class FolderWriter:
             for extra in self.partial.glob("*.png"):  # of a longer run before this one
                 if extra.stem not in mine:
                     extra.unlink()
-            old = None
-            if self.path.exists() and any(self.path.iterdir()):
-                old = Path(tempfile.mkdtemp(prefix=f"{self.path.name}.old.", dir=self.path.parent))
-                self.path.rename(old / self.path.name)
+            for position in self.partial.glob("resume*.npz"):
+                position.unlink()
+            noted(self.partial)
+            replaced = self.path.exists() and any(self.path.iterdir())
+            if replaced:
+                self.path.rename(self.replaced)
             if os.name == "nt":  # an open folder cannot be renamed there, and has no lock
                 self.holding.close()
             self.partial.rename(self.path)
             self.holding.close()
-        if old:
-            shutil.rmtree(old, ignore_errors=True)
+        if replaced:
+            shutil.rmtree(self.replaced, ignore_errors=True)
 
     def abandon(self) -> None:
         """Stops writing; a partial folder with pictures stays, for the next run to go on."""
@@ -363,7 +371,7 @@ class VideoWriter:
                 f"{self.path}: cannot be encoded ({error}): choose another output"
             ) from error
 
-    def finish(self) -> None:
+    def finish(self, noted: Noted = no_note) -> None:
         with self._encoding():
             if self.stream is not None:
                 self.waiting += self.stream.encode(None)
@@ -373,6 +381,7 @@ class VideoWriter:
                     packet.duration = self.step
                 self.container.mux(packet)
             self.container.close()
+            noted(self.partial)
             if os.name == "nt":  # an open file cannot be renamed there, and has no lock
                 self.held.close()
             self.partial.replace(self.path)
