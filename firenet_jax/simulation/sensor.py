@@ -15,6 +15,9 @@ may last two seconds. (An event in the last half microsecond of a window is stam
 window's end. The tensor on the device includes it; cutting the list into [start, end) puts it into
 the next window.)
 
+A pixel has at most one event of noise between two renderings. `event_list` inserts renderings for
+that; on the device noise is cut where there are fewer renderings than events of it.
+
 Flickering light is part of the sensor model, not of the scene: ground-truth images do not show it.
 
 Images are (H, W) float32 in [0, 1]. Sensors, states and runs are those of one sequence; `jax.vmap`

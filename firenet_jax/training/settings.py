@@ -71,7 +71,8 @@ class Train:
     """Truncated back-propagation through time: carry the state through up to this many steps.
     Simulated sequences of a batch differ in length (64, batch 4: 3, 8, 23, 64)."""
     renderings: int = 5
-    """Greatest number of renderings per window; on a CPU there are fewer where less moves."""
+    """Greatest number of renderings per window; on a CPU there are fewer where less moves. A pixel
+    has at most one event of noise between two, so of more --noise than that, there is less."""
     motion: tuple[float, float] = (1.25, 2.5)
     """Pixels by which the fastest point moves in a window, at most one per rendering; drawn
     log-uniformly for each sequence."""
