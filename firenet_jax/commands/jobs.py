@@ -211,9 +211,6 @@ def do_jobs(
             said = "warming up" if warming and not pictures else counted(pictures, "picture")
             progress.set_postfix_str(said, refresh=False)
             progress.update(read.read() - progress.n if read.total else chunk.count)
-    except BaseException:
-        outcome.stopped.set()
-        raise
     finally:
         finished.close()
         if screen:

@@ -447,8 +447,9 @@ def cw_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     The original has a steerable pyramid.
     Tolerates shifts of a pixel or two. Blind to a negative and to offsets.
     """
-    _check_sides(image, 17, "CW-SSIM needs")
-    scales = max(1, sum(min(image.shape[-2:]) >> scale >= 17 for scale in range(3)))
+    least = 17  # pixels, for 4x4 responses
+    _check_sides(image, least, "CW-SSIM needs")
+    scales = sum(min(image.shape[-2:]) >> scale >= least for scale in range(3))
     similarity = jnp.float32(0)
     for scale in range(scales):
         if scale:

@@ -28,7 +28,7 @@ def ahead(items: Iterator, depth: int = 2, broken: threading.Event | None = None
 
     An exception of `items` is raised here, in its place among the items. Closing this iterator
     (or leaving the loop over it) ends the thread and closes `items`, which is waited for.
-    broken: set before that by whatever is raised here, such as by Ctrl-C; for `until_set`.
+    broken: set before that, where this ends early, by closing it or by Ctrl-C; for `until_set`.
     """
     ready: queue.Queue = queue.Queue(depth)
     stop = threading.Event()

@@ -45,7 +45,7 @@ MP4_CLOCK = 90_000  # ticks per second, as is usual
 LONGEST_STEP = {".mp4": 2**28, ".gif": 2**16 - 1}
 # Of colours, as FFmpeg numbers them (ITU-T H.273): what its conversion from RGB makes, and sRGB.
 SD_MATRIX, LIMITED, REC_709, SRGB = 6, 1, 1, 13
-LONGEST_SIDE = 16_384  # pixels, of x264
+LONGEST_MP4_SIDE = 16_384  # pixels, of x264
 USUAL_RATE = 30  # pictures per second, the encoder's nominal rate without --fps
 PNG_LEVEL = 4  # on grey pictures 25 % faster than the default 6, files 2 % larger
 
@@ -298,10 +298,10 @@ class VideoWriter:
             self.stream.pix_fmt = "pal8"
             self.filter = _palette_filter(height, width, self.tick)
         else:
-            if max(height, width) > LONGEST_SIDE:
+            if max(height, width) > LONGEST_MP4_SIDE:
                 raise OutputError(
                     f"{self.path}: pictures of {width}x{height} are too large for an mp4, of which "
-                    f"a side has at most {LONGEST_SIDE} pixels: choose .gif or a folder"
+                    f"a side has at most {LONGEST_MP4_SIDE} pixels: choose .gif or a folder"
                 )
             self.stream = self.container.add_stream("libx264", rate=self.rate)
             self.stream.pix_fmt = "yuv420p"  # what every player can show
