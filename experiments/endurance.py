@@ -56,13 +56,9 @@ from firenet_jax.network import State, Weights, initial_state
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.simulation.curricula import random_setups, window_bounds
 from firenet_jax.simulation.scenes import SceneSettings, render
-from firenet_jax.simulation.sensor import (
-    FAULTY,
-    SensorSettings,
-    first_state,
-    simulate,
-)
+from firenet_jax.simulation.sensor import FAULTY, SensorSettings, first_state
 from firenet_jax.simulation.sensor import step as sensor_step
+from firenet_jax.simulation.sequences import simulate
 from firenet_jax.simulation.textures import HELD_OUT, load_textures, photographs
 
 SIZE = {"height": 120, "width": 160}

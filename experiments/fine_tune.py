@@ -19,10 +19,11 @@ from pathlib import Path
 from harness import save
 
 from firenet_jax.checkpoint import load_weights
-from firenet_jax.commands.train import Cut, Score, cut_off, judged, run
+from firenet_jax.commands.train import run
 from firenet_jax.readers import open_recording
 from firenet_jax.training.batches import Augment
 from firenet_jax.training.losses import Loss
+from firenet_jax.training.recordings import Cut, Score, cut_off, judged
 from firenet_jax.training.settings import Train
 
 # A chain keeps what a network remembers over hundreds of windows, which short sequences undo.

@@ -20,7 +20,7 @@ from firenet_jax.convolution import (
     choose,
     convolved_by_xla,
     parameter_gradients,
-    turned,
+    transposed_kernel,
 )
 
 Parameters = tuple[jax.Array, jax.Array]
@@ -99,11 +99,11 @@ def _gru_backward(machine_code, kept, by_state):
     change = by_state * update * (1 - q * q)
     left = reset * h  # recomputing is faster than storing it
     by_candidate = parameter_gradients(machine_code, (x, left), candidate, (change,))
-    arguments = change, turned(candidate), h, reset, update, q, by_state
+    arguments = change, transposed_kernel(candidate), h, reset, update, q, by_state
     by_x, by_reset, by_update, by_h = choose(machine_code, own_candidate, xla_candidate, *arguments)
     changes = by_reset, by_update
     by_gates = parameter_gradients(machine_code, (x, h), gates, changes)
-    arguments = changes, turned(gates), by_x, by_h
+    arguments = changes, transposed_kernel(gates), by_x, by_h
     by_x, by_h = choose(machine_code, own_gates, xla_gates, *arguments)
     return by_h, by_x, by_gates, by_candidate
 
@@ -154,10 +154,11 @@ def _residual_backward(machine_code, kept, by_result):
 
     by_result = jnp.where(result > 0, by_result, 0)
     by_second = parameter_gradients(machine_code, (between,), second, (by_result,))
-    arguments = by_result, turned(second), between
+    arguments = by_result, transposed_kernel(second), between
     (change,) = choose(machine_code, own_second, xla_second, *arguments)
     by_first = parameter_gradients(machine_code, (x,), first, (change,))
-    (by_x,) = choose(machine_code, own_first, xla_first, change, turned(first), by_result)
+    arguments = change, transposed_kernel(first), by_result
+    (by_x,) = choose(machine_code, own_first, xla_first, *arguments)
     return by_x, by_first, by_second
 
 

@@ -83,8 +83,8 @@ GOES_ON = {
     "evaluate": "the same command goes on with what is missing",
 }
 REPORT = (
-    "firenet: this is a fault of firenet, not of yours: please report it, with the command and all "
-    "these lines"
+    "firenet: this is a bug in firenet, not a mistake of yours: please report it, with the command "
+    "and all these lines"
 )
 
 

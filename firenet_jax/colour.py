@@ -34,26 +34,26 @@ def check_sides(height: int, width: int) -> None:
         )
 
 
-def corners(turned: bool) -> tuple[tuple[int, int], ...]:
-    """Row and column of red, green and blue; turned: of a picture rotated by 180 degrees."""
-    return tuple((1 - row, 1 - column) for row, column in CORNERS) if turned else CORNERS
+def corners(rotated: bool) -> tuple[tuple[int, int], ...]:
+    """Row and column of red, green and blue; rotated: of a picture rotated by 180 degrees."""
+    return tuple((1 - row, 1 - column) for row, column in CORNERS) if rotated else CORNERS
 
 
-def channels(tensors: jax.Array, turned: bool = False) -> jax.Array:
+def channels(tensors: jax.Array, rotated: bool = False) -> jax.Array:
     """Event tensors (..., H, W, 5), even sides -> (..., 3, H/2, W/2, 5): red, green and blue.
 
-    turned: they are rotated by 180 degrees, and with them the filter array."""
-    each = [tensors[..., row::2, column::2, :] for row, column in corners(turned)]
+    rotated: they are rotated by 180 degrees, and with them the filter array."""
+    each = [tensors[..., row::2, column::2, :] for row, column in corners(rotated)]
     return jnp.stack(each, -4)
 
 
-def coloured(greys: jax.Array, shades: jax.Array, turned: bool = False) -> jax.Array:
+def coloured(greys: jax.Array, shades: jax.Array, rotated: bool = False) -> jax.Array:
     """(..., H, W) and red, green and blue (..., 3, H/2, W/2), uint8 -> (..., H, W, 3) uint8.
 
-    turned: as in `channels`."""
+    rotated: as in `channels`."""
     each = [
         _full_size(_full_size(shades[..., channel, :, :] / 255.0, row, -2), column, -1)
-        for channel, (row, column) in enumerate(corners(turned))
+        for channel, (row, column) in enumerate(corners(rotated))
     ]
     lightness = to_lab(jnp.stack([greys / 255.0] * 3, -1))[..., :1]
     lab = jnp.concatenate([lightness, to_lab(jnp.stack(each, -1))[..., 1:]], -1)

@@ -112,7 +112,7 @@ def choose(machine_code: bool, own: Callable, xla: Callable, *arguments) -> Any:
     return native.choose(own, xla, *arguments) if machine_code else xla(*arguments)
 
 
-def turned(kernel: jax.Array) -> jax.Array:
+def transposed_kernel(kernel: jax.Array) -> jax.Array:
     """The kernel that maps gradients of the results to gradients of the maps."""
     return kernel[::-1, ::-1].swapaxes(2, 3)
 
@@ -134,7 +134,8 @@ def _backward(machine_code, activations, kept, gradients):
         return native.convolve(gradients, flipped, None, ("none",) * len(maps))
 
     xla = partial(convolved_by_xla, results=len(maps))
-    by_maps = choose(machine_code, images_by_machine_code, xla, gradients, turned(kernel))
+    back = transposed_kernel(kernel)
+    by_maps = choose(machine_code, images_by_machine_code, xla, gradients, back)
     return by_maps, *parameter_gradients(machine_code, maps, kernel, gradients)
 
 

@@ -32,7 +32,7 @@ LAUNCHERS = (
 )
 
 
-def share(process: int | None, processes: int | None) -> tuple[int, int]:
+def process_of(process: int | None, processes: int | None) -> tuple[int, int]:
     """(index of this process, from 0, number of processes): as given, else from a launcher, else
     (0, 1). The number alone may be given if a launcher states the index.
 
@@ -75,8 +75,8 @@ def join(coordinator: str | None, processes: int | None, process: int | None) ->
     """Joins the processes given by the settings, else those that srun or Open MPI has started, else
     does nothing. Raises SettingsError if JAX does not find the other processes."""
     if coordinator is not None:
-        process, processes = share(process, processes)
-    elif share(None, None)[1] == 1:
+        process, processes = process_of(process, processes)
+    elif process_of(None, None)[1] == 1:
         return
     # JAX's preemption service would catch SIGTERM, so that the process would not end.
     jax.config.update("jax_enable_preemption_service", False)
@@ -98,7 +98,7 @@ def check_processes(coordinator: str | None, processes: int | None, process: int
     """Raises SettingsError unless all three are given, or none, or a coordinator alone and a
     launcher states the rest."""
     if coordinator is not None:
-        share(process, processes)
+        process_of(process, processes)
     elif (processes, process) != (None, None):
         raise SettingsError("several processes need all of coordinator, processes and process")
 

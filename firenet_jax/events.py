@@ -40,6 +40,10 @@ class Events:
         """The events that a slice, a mask or an index array picks."""
         return Events(self.t[index], self.x[index], self.y[index], self.p[index])
 
+    def flat_index(self, width: int) -> np.ndarray:
+        """(N,) int64, where each event's pixel is in a flattened picture of this width."""
+        return self.y.astype(np.int64) * width + self.x
+
     def backwards(self) -> "Events":
         """The same seen in reversed time: what became brighter becomes darker."""
         back = self.select(slice(None, None, -1))
@@ -160,9 +164,9 @@ class Recording:
     format: str
     """In words: "text", "AEDAT4"."""
     height: int
-    """Of the sensor, pixels."""
+    """Rows of the sensor."""
     width: int
-    """Of the sensor, pixels."""
+    """Columns of the sensor."""
     events: Callable[[], Iterator[Events]]
     """Called, it gives all events from the first one on, in chunks."""
     count: int | None = None
@@ -178,7 +182,7 @@ class Recording:
 
     @property
     def pixels(self) -> int:
-        """Of the sensor, how many."""
+        """Number of pixels of the sensor."""
         return self.height * self.width
 
 

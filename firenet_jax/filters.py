@@ -12,7 +12,7 @@ from scipy.ndimage import median_filter
 
 from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.events import MAX_TIME, Events, Recording, until_damage
-from firenet_jax.storage.files import check_no_pipe, check_readable
+from firenet_jax.storage.files import read_lines
 
 LEARN_FROM = 5_000_000  # events among which hot pixels are looked for
 
@@ -41,7 +41,7 @@ def between(chunks: Iterable[Events], start: float | None, stop: float | None) -
             return
 
 
-def without(chunks: Iterable[Events], hot: np.ndarray) -> Iterator[Events]:
+def without_hot_pixels(chunks: Iterable[Events], hot: np.ndarray) -> Iterator[Events]:
     """Drops the events of hot pixels; hot: (H, W) bool.
 
     They are dropped before the recording is cut into windows, so a window of N events holds N
@@ -53,7 +53,7 @@ def without(chunks: Iterable[Events], hot: np.ndarray) -> Iterator[Events]:
             yield kept
 
 
-def turned(chunks: Iterable[Events], height: int, width: int) -> Iterator[Events]:
+def rotated(chunks: Iterable[Events], height: int, width: int) -> Iterator[Events]:
     """Rotates the picture by 180 degrees, for cameras that are mounted upside down."""
     for events in chunks:
         yield replace(events, x=width - 1 - events.x, y=height - 1 - events.y)
@@ -70,8 +70,7 @@ def find_hot_pixels(recording: Recording, most: int = LEARN_FROM) -> np.ndarray:
     counts = np.zeros(recording.pixels, np.int64)
     seen = 0
     for events in until_damage(recording.events()):
-        pixels = events.y.astype(np.int64) * recording.width + events.x
-        counts += np.bincount(pixels, minlength=counts.size)
+        counts += np.bincount(events.flat_index(recording.width), minlength=counts.size)
         seen += len(events)
         if seen >= most:
             break
@@ -99,14 +98,7 @@ def read_hot_pixels(path: str | Path, height: int, width: int) -> np.ndarray:
     """
     path = Path(path)
     hot = np.zeros((height, width), bool)
-    check_readable(path, RecordingError)
-    check_no_pipe(path, RecordingError)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text"
-        raise RecordingError(f"{path}: cannot read this list of hot pixels: {reason}") from error
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(read_lines(path, "list of hot pixels"), 1):
         if not line.strip():
             continue
         try:

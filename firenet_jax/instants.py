@@ -115,8 +115,9 @@ def warming(
     """Windows -> (the first `count` of them as steps, forwards and then backwards in time; all
     windows again).
 
-    Fewer, but one, if they hold more than 0.4 events per pixel on the mean (of twenty, where fewer
-    are wanted): they are kept in memory. An error of the windows is raised where it was.
+    Fewer, but at least one, once they hold more than 0.4 events per pixel on average (over at least
+    20 windows), as they are kept in memory. An error while reading them is raised later, at its
+    place in the second iterator.
     """
     cutter = iter(cutter)
     seen: deque[Window] = deque()

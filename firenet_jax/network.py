@@ -169,11 +169,12 @@ def step(
     `reconstruct` is quicker: all of a window in one piece of machine code (`native.step`).
 
     event_tensor: float32, normalised if the weights expect it (`tensors.normalise`). Images are
-    float32, 0 to 1 but for what goes beyond.
+    float32, nominally 0 to 1, not clipped.
     exists: (B,) bool; where False the state is unchanged and the image is undefined (the event
     tensor must still be finite there, for example zeros).
     dtype: of the convolutions; jnp.bfloat16 trades accuracy for speed on accelerators.
-    Raises ValueError for shapes that do not match, TypeError for what is no array or state.
+    Raises ValueError for shapes that do not match, TypeError for what is not an array or
+    not a State.
     """
     if isinstance(params, Weights):
         raise TypeError("step takes the parameters alone: pass weights.params")

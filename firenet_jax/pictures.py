@@ -23,12 +23,13 @@ from firenet_jax.errors import SettingsError
 from firenet_jax.settings import check_arrays, check_sizes
 
 HISTORY = 11  # images whose ranges have a median, which is the range shown
-# Of the automatic range: the part of the pixels that may be darker, and that may be brighter; what
-# is left between them and black and white; its least width, so that noise is not blown up; how
-# many pixels, on a grid, it is read from.
-BEYOND, MARGIN, NARROWEST, SAMPLES = 0.005, 0.05, 0.35, 4096
-# Of what makes a range as wide as that, the part below: where nothing has been seen the ground is
-# light grey, as most grounds are, and hardly changes when something enters that is darker.
+# Of the automatic range:
+BEYOND = 0.005  # share of the pixels that may be darker than black, and that may be brighter
+MARGIN = 0.05  # of the range, added at each end
+NARROWEST = 0.35  # least width, so that noise is not amplified
+SAMPLES = 4096  # pixels, on a grid, from which it is read
+# Share of a widening to NARROWEST that goes below: an image in which nothing has been seen is then
+# light grey, as most backgrounds are, and hardly changes when something darker enters.
 BELOW = 2 / 3
 BORDER = 2  # pixels, which the unsharp mask brightens, as there is nothing beyond them
 
@@ -120,15 +121,16 @@ def display(
     `automatic_range`, or of clip(min, 0, 0.45) and clip(max, 0.55, 1). Where the range is fixed the
     state is not used.
     valid: (T, B) bool; images that are not valid leave the state as it was. None: all are.
-    Raises ValueError for images of another shape, a state of another number of recordings, or
-    another valid, where the range is not fixed; TypeError for what is no array, or then no state.
+    Raises TypeError for what is not an array. Unless the range is fixed, also TypeError for a state
+    of another type, and ValueError unless images are (T, B, H, W), the state is of B recordings and
+    valid is bool (T, B).
     """
     check_arrays(images=images, valid=valid)
     images = jnp.asarray(images, jnp.float32)
     if settings.unsharp:
         images = unsharp_mask(images, settings.unsharp)
     if settings.range == "fixed":
-        return state, _to_8_bit(images, settings.bilateral)
+        return state, to_8_bit(images, settings.bilateral)
     if not isinstance(state, DisplayState):
         raise TypeError(
             f"the state is a {type(state).__name__}: make it with initial_display_state(batch)"
@@ -161,7 +163,7 @@ def display(
 
     state, (low, high) = jax.lax.scan(remember, state, (lows, highs, valid))
     low, high = low[..., None, None], high[..., None, None]
-    return state, _to_8_bit((images - low) / (high - low), settings.bilateral)
+    return state, to_8_bit((images - low) / (high - low), settings.bilateral)
 
 
 def automatic_range(images: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -183,7 +185,9 @@ def automatic_range(images: jax.Array) -> tuple[jax.Array, jax.Array]:
     return low - margin - BELOW * missing, high + margin + (1 - BELOW) * missing
 
 
-def _to_8_bit(images: jax.Array, sigma: float) -> jax.Array:
+def to_8_bit(images: jax.Array, sigma: float = 0.0) -> jax.Array:
+    """(..., H, W) float32, clipped to [0, 1] -> the same uint8, after a bilateral filter if sigma
+    is not 0."""
     images = jnp.clip(images, 0, 1)
     images = bilateral(images, sigma) if sigma else images
     return jnp.round(255 * images).astype(jnp.uint8)

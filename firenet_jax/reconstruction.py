@@ -21,10 +21,9 @@ from jax.sharding import Mesh
 from firenet_jax import colour, native
 from firenet_jax.devices import BATCH, REPLICATED, TIME_BATCH, on_each_device
 from firenet_jax.errors import logger
-from firenet_jax.events import Recording, check_recording, until_damage
+from firenet_jax.events import BINS, Recording, check_recording, until_damage
 from firenet_jax.instants import WARM_UP, Counts, Grid, Step, check, steps, warming
 from firenet_jax.network import (
-    BINS,
     CHANNELS,
     State,
     Weights,
@@ -308,8 +307,8 @@ def images_at(
     chunk: steps per call of the device. Memory holds one chunk, whatever the recording's length.
     warm_up: windows of the beginning that the network sees beforehand, see `instants.warming`.
     Raises ValueError for invalid windows and for times that are not whole or not in order,
-    RecordingError if the file is damaged before the last of them, TypeError for what are no weights
-    or is no recording.
+    RecordingError if the file is damaged before the last of them, TypeError for weights or a
+    recording of another type.
     """
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}, but must be 1 or more steps")
@@ -334,7 +333,8 @@ def images_at(
             yield found, np.asarray(images)[seen, 0]
     if not counts.seen and counts.early + counts.late:
         logger.warning(
-            "%s: no image is wanted while it lasts (%s): times are microseconds on its clock",
+            "%s: none of the requested times lies within it (%s): times are microseconds on its "
+            "clock",
             recording.path, counts.outside,
         )  # fmt: skip
 
@@ -397,7 +397,7 @@ def padding(height: int, width: int, multiple: int) -> tuple[tuple[int, int], tu
 
 @partial(
     jax.jit,
-    static_argnames=("height", "width", "network", "settings", "preview", "turned", "raw", "mesh"),
+    static_argnames=("height", "width", "network", "settings", "preview", "rotated", "raw", "mesh"),
 )
 def events_to_pictures(
     weights: Weights,
@@ -411,7 +411,7 @@ def events_to_pictures(
     network: Network = Network(),
     settings: Display = Display(),
     preview: bool = False,
-    turned: bool = False,
+    rotated: bool = False,
     raw: bool = False,
     mesh: Mesh | None = None,
 ) -> tuple[Session, jax.Array]:
@@ -422,7 +422,7 @@ def events_to_pictures(
     beside the reconstruction.
     valid: (T, B) bool, as in `reconstruct`.
     steps: which steps are looks, for a session `at_times`; pictures of kept steps are undefined.
-    turned: the events are rotated by 180 degrees, and with them a sensor's colour filter array.
+    rotated: the events are rotated by 180 degrees, and with them a sensor's colour filter array.
     raw: the network's images, (T, B, H, W) float32, in place of pictures.
     mesh: devices that share the B recordings equally, for events from `pack_for_devices`.
     """
@@ -464,14 +464,14 @@ def events_to_pictures(
         inputs = normalise(tensors) if early else tensors
         after, pictures = shown(weights, session, inputs, valid, steps)
         if network.color:
-            planes = colour.channels(inputs, turned)  # (T, B, 3, H/2, W/2, 5)
+            planes = colour.channels(inputs, rotated)  # (T, B, 3, H/2, W/2, 5)
             planes = planes.reshape(len(planes), -1, *planes.shape[3:])
             each = partial(jnp.repeat, repeats=3, axis=1)
             channels, shades = shown(
                 weights, _fold(session.channels), planes, *jax.tree.map(each, (valid, steps))
             )
             shades = shades.reshape(len(planes), -1, 3, *shades.shape[2:])
-            pictures = colour.coloured(pictures, shades, turned)
+            pictures = colour.coloured(pictures, shades, rotated)
             after = after._replace(channels=_unfold(channels))
         if preview:
             if not network.color:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, overload
 
 from firenet_jax.errors import SettingsError
@@ -50,7 +50,7 @@ def check_seed(seed: int) -> None:
 def check_share(name: str, share: float, of: str) -> None:
     """Raises SettingsError unless this is a share of all `of`."""
     if not 0 <= share <= 1:
-        raise SettingsError(f"{name} is {share}, but is a part of the {of}, 0-1")
+        raise SettingsError(f"{name} is {share}, but must be a share of the {of}, from 0 to 1")
 
 
 def check_sizes(settings: Any, *names: str, zero: bool = False) -> None:
@@ -76,7 +76,20 @@ def check_none_idle(settings, names: Iterable[str], where: str) -> None:
     if idle:
         said = ", ".join(idle).replace("_", "-")
         them = "it" if len(idle) == 1 else "them"
-        raise SettingsError(f"{said}: no part in {where}: leave {them} out")
+        raise SettingsError(f"{said}: no effect with {where}: leave {them} out")
+
+
+def check_refined(
+    settings: Any, needs: dict[str, str], is_on: Callable[[Any], bool] = bool
+) -> None:
+    """Raises SettingsError for an option that only refines another one which is off.
+
+    needs: option -> the one that it refines, both as the fields are named."""
+    for name, needed in needs.items():
+        changed = getattr(settings, name) != getattr(type(settings), name)
+        if changed and not is_on(getattr(settings, needed)):
+            more, option = name.replace("_", "-"), needed.replace("_", "-")
+            raise SettingsError(f"--{more} has no effect without --{option}: pass that, too")
 
 
 def check_range(name: str, bounds: tuple[float, float]) -> None:

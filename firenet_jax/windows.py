@@ -20,6 +20,7 @@ from firenet_jax.events import Events, Recording, concatenate, counted
 MAX_GAP = 3_600_000_000  # microseconds between two events, or events and frames, of one clock
 MAX_NUMBER = 2**31 - 1
 DEFAULT_LONGEST = 40.0  # milliseconds: at least 25 pictures per second
+USUAL_DENSITY = 0.35  # events per pixel and window
 MIN_WINDOWS = 20  # of a short recording: its windows are shorter than DEFAULT_LONGEST
 
 
@@ -71,8 +72,6 @@ class Windows:
                 )
             if self.duration is None and self.step != int(self.step):
                 raise SettingsError(f"step is {self.step}, but counts events: pass a whole number")
-            if self.duration is not None and round(self.step * 1000) < 1:
-                raise SettingsError(f"step is {self.step} ms, but times are whole microseconds")
             window = self.duration or self.events
             if window is not None and self.step > window:
                 unit = "ms" if self.duration else "events"
@@ -82,18 +81,16 @@ class Windows:
         if self.longest is not None:
             if self.duration is not None or self.frame_to_frame or self.step is not None:
                 raise SettingsError("longest limits windows of events, which do not overlap")
-            if round(self.longest * 1000) < 1:
-                raise SettingsError(
-                    f"longest is {self.longest} ms, but times are whole microseconds"
-                )
-        if self.duration is not None and round(self.duration * 1000) < 1:
-            raise SettingsError(f"duration is {self.duration} ms, but times are whole microseconds")
+        for name in ("duration", "longest", *(["step"] if self.duration is not None else [])):
+            value = getattr(self, name)
+            if value is not None and round(value * 1000) < 1:
+                raise SettingsError(f"{name} is {value} ms, but times are whole microseconds")
 
     def count(self, pixels: int) -> int:
         """Events in a full window of a sensor with this many pixels (windows in time ignore it)."""
         if self.events is not None:
             return int(self.events)  # 1e4 is a number of events, too
-        return max(1, round((self.events_per_pixel or 0.35) * pixels))
+        return max(1, round((self.events_per_pixel or USUAL_DENSITY) * pixels))
 
 
 def usual(chunks: Iterable[Events]) -> Windows:
@@ -119,7 +116,8 @@ def in_words(windows: Windows, pixels: int) -> str:
     elif windows.events is not None:
         said = f"windows of {counted(count, 'event')}"
     else:
-        said = f"windows of {windows.events_per_pixel or 0.35:g} events per pixel ({count:,})"
+        density = windows.events_per_pixel or USUAL_DENSITY
+        said = f"windows of {density:g} events per pixel ({count:,})"
     if windows.step is not None:
         said += f", one every {windows.step:g} {'ms' if windows.duration else 'events'}"
     return said + ("" if windows.longest is None else f", at most {windows.longest:g} ms")
@@ -169,9 +167,10 @@ def warn_if_unusual(events: float, pixels: int) -> None:
     if not 0.1 <= density <= 1.5:
         logger.warning(
             "%s per window %s %s per pixel: fewer than 0.1 give noisy and faint images, "
-            "more than 1.5 smeared ones; 0.35 (%d events) is usual for this sensor",
+            "more than 1.5 smeared ones; %g (%d events) is usual for this sensor",
             counted(round(events), "event"), "is" if events == 1 else "are",
-            f"{density:,.0f}" if density >= 100 else f"{density:.3g}", round(0.35 * pixels),
+            f"{density:,.0f}" if density >= 100 else f"{density:.3g}", USUAL_DENSITY,
+            round(USUAL_DENSITY * pixels),
         )  # fmt: skip
 
 

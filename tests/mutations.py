@@ -35,6 +35,7 @@ MODULES = {  # what is changed: the tests that must find it
     "training/losses.py": ["losses"],
     "evaluation/metrics.py": ["metrics"],
     "simulation/sensor.py": ["sensor"],
+    "simulation/sequences.py": ["sensor"],
     "simulation/curricula.py": ["curricula"],
 }
 EQUIVALENT = {  # (module, line after the change): why nothing changes
@@ -57,11 +58,11 @@ EQUIVALENT = {  # (module, line after the change): why nothing changes
     ("reconstruction.py", "chunk: int = 9,"): "how many windows at a time is speed alone",
     (
         "windows.py",
-        'f"{density:,.0f}" if density > 100 else f"{density:.3g}", round(0.35 * pixels),',
+        'f"{density:,.0f}" if density > 100 else f"{density:.3g}", USUAL_DENSITY,',
     ): "100 reads the same in both ways",
     (
         "windows.py",
-        'f"{density:,.0f}" if density >= 101 else f"{density:.3g}", round(0.35 * pixels),',
+        'f"{density:,.0f}" if density >= 101 else f"{density:.3g}", USUAL_DENSITY,',
     ): "from 100 to 101 it reads the same in both ways",
 }
 
@@ -157,7 +158,7 @@ _also("simulation/curricula.py", "random numbers are hardly ever just that",
       "share = jnp.where(kind <= NEARLY_NOISELESS * slow, 0.02, 1.0)",
       "stopped = scenes.pauses[:, 0, 1] - scenes.pauses[:, 0, 0] >= windows * seconds",
       )  # fmt: skip
-_also("simulation/sensor.py", "how many at a time is speed alone",
+_also("simulation/sequences.py", "how many at a time is speed alone",
       "EVENTS_PER_PASS = 5  # of a pixel, in one pass over the picture: saves memory traffic",
       *(f"span = min({bins}, BINS)  # bins that votes of one rendering reach" for bins in (
           "-(-(BINS - 1) // renderings) + 3", "-(-(BINS + 1) // renderings) + 2",
@@ -204,7 +205,7 @@ _also("simulation/sensor.py", "it is never 0 there",
       "on = run.polarity[y, x][row] >= 0",
       )  # fmt: skip
 _also("simulation/sensor.py", "it is written before it is read", "state, previous = None, 1")
-_also("simulation/sensor.py", "after the last event nothing votes",
+_also("simulation/sequences.py", "after the last event nothing votes",
       "_, voted = jax.lax.while_loop(lambda carry: carry[0] <= most, several, start)",
       )  # fmt: skip
 _also("simulation/sensor.py", "without noise its slope says nothing",

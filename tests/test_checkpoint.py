@@ -17,7 +17,8 @@ from firenet_jax.checkpoint import (
     save_weights,
 )
 from firenet_jax.commands.convert import Convert, run
-from firenet_jax.export.tensors_file import pth
+from firenet_jax.errors import OutputError
+from firenet_jax.export.weights_file import pth
 from firenet_jax.network import Weights, initial_params, initial_state, step
 
 # name in PyTorch -> shape there, as the two published families list them
@@ -384,7 +385,7 @@ def test_convert_command(tmp_path, converted, capsys):
     run(settings)
     assert "37,777 parameters, for raw event tensors" in capsys.readouterr().out
     assert_equal(load_weights(tmp_path / "w.npz"), expected)
-    with pytest.raises(CheckpointError, match="w.npz exists; choose another name"):
+    with pytest.raises(OutputError, match="w.npz exists: choose another output"):
         run(settings)
 
 

@@ -45,11 +45,11 @@ def test_channels_are_the_pixels_of_the_mosaic():
 def test_a_rotated_mosaic_has_the_rotated_channels_and_colours():
     rng = np.random.default_rng(2)
     tensors = rng.standard_normal((1, 4, 6, 5))
-    found = colour.channels(tensors[:, ::-1, ::-1], turned=True)
+    found = colour.channels(tensors[:, ::-1, ::-1], rotated=True)
     np.testing.assert_array_equal(found, colour.channels(tensors)[..., ::-1, ::-1, :])
     greys = rng.integers(90, 160, (8, 10)).astype(np.uint8)
     shades = rng.integers(90, 160, (3, 4, 5)).astype(np.uint8)
-    found = colour.coloured(greys[::-1, ::-1], shades[:, ::-1, ::-1], turned=True)
+    found = colour.coloured(greys[::-1, ::-1], shades[:, ::-1, ::-1], rotated=True)
     expected = np.asarray(colour.coloured(greys, shades)).astype(int)
     assert np.abs(np.asarray(found)[::-1, ::-1] - expected).max() <= 1
 

@@ -18,7 +18,8 @@ from firenet_jax.simulation.curricula import (
     window_bounds,
 )
 from firenet_jax.simulation.scenes import SceneSettings
-from firenet_jax.simulation.sensor import FAULTY, Sensor, SensorSettings, simulate
+from firenet_jax.simulation.sensor import FAULTY, Sensor, SensorSettings
+from firenet_jax.simulation.sequences import simulate
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.training.settings import Train
 

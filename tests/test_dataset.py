@@ -363,7 +363,7 @@ def test_a_size_may_be_written_in_several_ways():
 
 
 def test_overwrite_is_of_a_video():
-    with pytest.raises(SettingsError, match="overwrite: no part in simulating scenes"):
+    with pytest.raises(SettingsError, match="overwrite: no effect with simulating scenes"):
         Simulate(Path("set"), overwrite=True)
 
 
@@ -632,12 +632,12 @@ def test_everything_wrong_is_one_sentence(tmp_path, monkeypatch, capsys):
         ("-o new --cutoff-dark .5 --faults --cutoff 0 0", "--cutoff-dark says more of --cutoff"),
         (
             "-o new.h5 --video clip.mp4 --fps 5 --objects 7",
-            "fps, objects: no part in turning",
+            "fps, objects: no effect with turning",
         ),
         ("-o new.h5 --video clip.mp4 --flicker .1 .9", "too far apart to show it"),
         (
             "-o new.h5 --video clip.mp4 --process 1 --processes 2",
-            "process, processes: no part in turning",
+            "process, processes: no effect with turning",
         ),
     ],
 )

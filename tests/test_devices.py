@@ -44,7 +44,7 @@ def no_launcher(monkeypatch):
 def test_share(monkeypatch, environment, given, expected):
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    assert devices.share(*given) == expected
+    assert devices.process_of(*given) == expected
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_shares_that_cannot_be(monkeypatch, environment, given, said):
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     with pytest.raises(ValueError, match=said):
-        devices.share(*given)
+        devices.process_of(*given)
 
 
 def test_a_coordinator_may_stand_alone_where_a_launcher_says_the_rest(monkeypatch):

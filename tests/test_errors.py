@@ -42,7 +42,9 @@ def test_a_fault_of_ours_shows_where_it_is_and_asks_for_a_report(monkeypatch, ki
     with pytest.raises(kind) as caught:
         cli.main(["info", "a.txt"])
     said = "".join(traceback.format_exception(caught.value))
-    assert said.splitlines()[-1].startswith("firenet: this is a fault of firenet, not of yours")
+    assert said.splitlines()[-1].startswith(
+        "firenet: this is a bug in firenet, not a mistake of yours"
+    )
     assert "test_errors.py" in said and "Traceback" in said
 
 

@@ -352,17 +352,19 @@ def test_damaged_pictures_of_an_earlier_run_are_named(folder, tmp_path):
 def test_options_of_e2vid_without_it_are_refused(folder, tmp_path):
     for name in ("e2vid_random", "e2vid_sigmoid"):
         choice = {name: not getattr(Evaluate, name), "methods": "hf"}
-        with pytest.raises(SettingsError, match=f"{name.replace('_', '-')}: no part in an eval"):
+        with pytest.raises(
+            SettingsError, match=f"{name.replace('_', '-')}: no effect with an eval"
+        ):
             settings(folder, tmp_path / "out", **choice)
 
 
 def test_options_that_would_do_nothing_are_refused(folder, tmp_path):
     ours = partial(settings, folder, tmp_path / "out", methods="firenet,e2vid")
-    with pytest.raises(SettingsError, match="seed: no part in an evaluation of all frames"):
+    with pytest.raises(SettingsError, match="seed: no effect with an evaluation of all frames"):
         ours(seed=5)
     ours(seed=5, keep_ratio=0.5)
     for choice in ({"e2vid_sigmoid": False}, {"e2vid_weights": tmp_path / "e2vid.pth"}):
-        with pytest.raises(SettingsError, match="no part in an evaluation with random weights"):
+        with pytest.raises(SettingsError, match="no effect with an evaluation with random weights"):
             ours(e2vid_random=True, **choice)
 
 
@@ -507,7 +509,7 @@ def test_a_filter_of_single_events_looks_at_those_since_its_last_window(folder):
 def test_times_that_a_recording_does_not_have_are_a_gap(folder, tmp_path):
     with pytest.raises(RecordingError, match="holds no triggers"):
         at_times(folder, tmp_path / "out", Times(triggers=True))
-    with pytest.raises(RecordingError, match="cannot read this file of times"):
+    with pytest.raises(RecordingError, match="cannot read this list of times"):
         at_times(folder, tmp_path / "none", Times(at=tmp_path / "none.txt"))
     assert not (tmp_path / "none").exists()
 

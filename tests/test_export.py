@@ -12,7 +12,7 @@ import firenet_jax as fj
 from firenet_jax.checkpoint import convert, load_weights, save_weights
 from firenet_jax.export.onnx_model import onnx_model
 from firenet_jax.export.stablehlo import stablehlo
-from firenet_jax.export.tensors_file import pth, safetensors
+from firenet_jax.export.weights_file import pth, safetensors
 from firenet_jax.network import Weights, initial_state
 from firenet_jax.pictures import Display
 from firenet_jax.storage.pytorch_save import pytorch_file

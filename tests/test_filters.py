@@ -30,12 +30,12 @@ def test_between_stops_reading_at_the_end():
 def test_without_drops_hot_pixels():
     hot = np.zeros((2, 3), bool)
     hot[1, 2] = True
-    events = concatenate(list(filters.without(recording_of(range(60)).events(), hot)))
+    events = concatenate(list(filters.without_hot_pixels(recording_of(range(60)).events(), hot)))
     assert len(events) == 50 and not ((events.x == 2) & (events.y == 1)).any()
 
 
 def test_turned_is_a_turn_by_180_degrees():
-    events = next(filters.turned(iter([Events.of([0, 1], [0, 16], [0, 3], [1, 0])]), 12, 17))
+    events = next(filters.rotated(iter([Events.of([0, 1], [0, 16], [0, 3], [1, 0])]), 12, 17))
     assert events.x.tolist() == [16, 0] and events.y.tolist() == [11, 8]
     assert events.x.dtype == np.int16
 

@@ -30,10 +30,10 @@ from firenet_jax.live.engine import (
     Figures,
     Limits,
     Waiting,
-    cooled,
     pictures,
     sound,
     windows,
+    without_hot_pixels,
 )
 from firenet_jax.live.page import Board, serve
 from firenet_jax.network import Weights, initial_params
@@ -399,13 +399,13 @@ def test_hot_pixels_are_found_as_events_come_and_left_out(tmp_path):
     whole = concatenate([usual, hot])
     whole = whole.select(np.argsort(whole.t, kind="stable"))
     cuttings = [whole.select(slice(k, k + 100)) for k in range(0, len(whole), 100)]
-    found = list(cooled([Events.empty(), *cuttings], HEIGHT, WIDTH))
+    found = list(without_hot_pixels([Events.empty(), *cuttings], HEIGHT, WIDTH))
     assert len(found) == len(cuttings) + 1  # an empty arrival tells the time
     late = concatenate(found[len(found) // 4 :])
     assert not np.any((late.x == 7) & (late.y == 3))
     expected = find_hot_pixels(recording_of(tmp_path, whole))
     assert expected.sum() == 1
-    left = concatenate(list(cooled(cuttings, HEIGHT, WIDTH, expected)))
+    left = concatenate(list(without_hot_pixels(cuttings, HEIGHT, WIDTH, expected)))
     assert rows(left) == [row for row in rows(whole) if row[1:3] != (7, 3)]
 
 
@@ -640,9 +640,12 @@ def test_a_named_pipe_is_read_by_standard_input(tmp_path):
         ("a.txt --replay --longest 0.0004", "longest"),
         ("a.txt --replay --longest inf", "longest"),
         ("a.txt --replay --port 70000", "ports are 0 to 65535"),
-        ("a.txt --sensor-size 20x12 --speed 2 --repeat 3", "speed, repeat: no part in a stream"),
-        ("a.txt --replay --wire text", "wire: no part in a replay"),
-        ("camera --sensor-size 20x12", "sensor-size: no part in a camera"),
+        (
+            "a.txt --sensor-size 20x12 --speed 2 --repeat 3",
+            "speed, repeat: no effect with a stream",
+        ),
+        ("a.txt --replay --wire text", "wire: no effect with a replay"),
+        ("camera --sensor-size 20x12", "sensor-size: no effect with a camera"),
     ],
 )
 def test_mistakes_are_one_sentence(tmp_path, monkeypatch, capsys, arguments, expected):

@@ -3,12 +3,12 @@ import time
 
 import pytest
 
-from firenet_jax.storage.overlap import ahead
+from firenet_jax.storage.overlap import prefetch
 
 
 def test_gives_the_same_items_in_order():
-    assert list(ahead(iter(range(100)))) == list(range(100))
-    assert list(ahead(iter([]))) == []
+    assert list(prefetch(iter(range(100)))) == list(range(100))
+    assert list(prefetch(iter([]))) == []
 
 
 def test_depth_items_wait_and_one_is_in_hand():
@@ -19,7 +19,7 @@ def test_depth_items_wait_and_one_is_in_hand():
             made.append(i)
             yield i
 
-    stream = ahead(items(), depth=2)
+    stream = prefetch(items(), depth=2)
     assert next(stream) == 0
     time.sleep(0.3)
     assert 3 <= len(made) <= 4  # one taken, two waiting, one in hand
@@ -31,7 +31,7 @@ def test_an_exception_arrives_in_its_place():
         yield 1
         raise ZeroDivisionError("here")
 
-    stream = ahead(items())
+    stream = prefetch(items())
     assert next(stream) == 1
     with pytest.raises(ZeroDivisionError, match="here"):
         next(stream)
@@ -48,7 +48,7 @@ def test_leaving_early_ends_the_thread_and_closes_the_source():
             closed.set()
 
     before = threading.active_count()
-    stream = ahead(ahead(items()))
+    stream = prefetch(prefetch(items()))
     next(stream)
     stream.close()
     assert closed.wait(5) and threading.active_count() == before
@@ -65,7 +65,7 @@ def test_leaving_early_waits_until_the_source_is_closed():
             time.sleep(0.3)
             closed.append(True)
 
-    stream = ahead(items())
+    stream = prefetch(items())
     next(stream)
     stream.close()
     assert closed

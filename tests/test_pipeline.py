@@ -816,10 +816,10 @@ def test_real_time_is_the_default_and_each_event_is_counted_once(tmp_path, weigh
     with pytest.raises(ValueError, match="fps and speed"):
         settings(weights, (recording,), tmp_path / "a.mp4", fps=5.0, speed=1.0)
     for name, choice, said in (
-        ("out", {"speed": 0.5}, "speed: no part in a folder of pictures"),
-        ("a.h5", {"fps": 5.0, "topic": "/a"}, "fps, topic: no part in a .h5"),
-        ("a.bag", {"speed": 1.0}, "speed: no part in a .bag"),
-        ("a.mp4", {"frame_id": "a"}, "frame-id: no part in a .mp4"),
+        ("out", {"speed": 0.5}, "speed: no effect with a folder of pictures"),
+        ("a.h5", {"fps": 5.0, "topic": "/a"}, "fps, topic: no effect with a .h5"),
+        ("a.bag", {"speed": 1.0}, "speed: no effect with a .bag"),
+        ("a.mp4", {"frame_id": "a"}, "frame-id: no effect with a .mp4"),
     ):
         with pytest.raises(SettingsError, match=said):
             settings(weights, (recording,), tmp_path / name, **choice)

@@ -138,7 +138,7 @@ def test_times_outside_of_a_recording(tmp_path, weights, caplog):  # noqa: F811
     run(settings(weights, (recording,), tmp_path / "out", times=some))
     assert "times without an image: 1 before the first event, 2 after the last" in caplog.text
     assert stamps_of(tmp_path / "out")[:, 1].tolist() == [500_000]
-    with pytest.raises(RecordingError, match="no image is wanted while it lasts"):
+    with pytest.raises(RecordingError, match="none of the requested times lies within it"):
         run(settings(weights, (recording,), tmp_path / "other", times=none))
     assert not (tmp_path / "other").exists()
     with pytest.raises(RecordingError, match="a.txt: has no frames"):

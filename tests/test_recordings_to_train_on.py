@@ -12,15 +12,16 @@ from test_train import begun, entries, tiny
 import firenet_jax as fj
 from firenet_jax import cli
 from firenet_jax.checkpoint import save_weights
-from firenet_jax.commands import train
+from firenet_jax.commands.train import run
 from firenet_jax.errors import FirenetError, OutputError, RecordingError, SettingsError
 from firenet_jax.evaluation import metrics
 from firenet_jax.events import Events, concatenate
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.readers import open_recording
-from firenet_jax.simulation.sensor import Simulation
+from firenet_jax.simulation.sequences import Simulation
 from firenet_jax.storage.files import locked
 from firenet_jax.storage.sequence_file import Picture, write_sequence
+from firenet_jax.training import recordings
 from firenet_jax.training.batches import Augment
 from firenet_jax.training.settings import Train
 from firenet_jax.training.step import initial_train_state, loss_of, near_events, train_step
@@ -67,7 +68,7 @@ def all_events(path):
 
 def test_the_parts_hold_what_the_recording_holds_between_its_frames(tmp_path, folder):
     settings = tiny(tmp_path / "run", data=(folder,))
-    train.write_sequences([train.cut_off(folder, settings.windows)], settings)
+    recordings.write_sequences([recordings.cut_off(folder, settings.windows)], settings)
     parts = settings.sequences / "000_noise.h5", settings.sequences / "validation/000_noise.h5"
     whole = open_recording(folder)
     events, times = all_events(folder), whole.frames.times
@@ -85,40 +86,40 @@ def test_the_parts_hold_what_the_recording_holds_between_its_frames(tmp_path, fo
 
 @pytest.mark.parametrize("frames, windows, end", [(50, 3, 40), (50, 21, 28), (8, 3, 4)])
 def test_a_fifth_is_held_out_and_no_fewer_windows_than_a_step_has(tmp_path, frames, windows, end):
-    assert train.cut_off(write_folder(tmp_path / "a", frames), windows).end == end
+    assert recordings.cut_off(write_folder(tmp_path / "a", frames), windows).end == end
 
 
 def test_recordings_that_cannot_be_learnt_from_are_said(tmp_path, folder):
     (tmp_path / "events.txt").write_text("40 40\n0.1 3 3 1\n0.2 3 3 0\n")
     with pytest.raises(RecordingError, match="holds no frames to learn from"):
-        train.cut_off(tmp_path / "events.txt", 3)
+        recordings.cut_off(tmp_path / "events.txt", 3)
     with pytest.raises(RecordingError, match="has 20 frames, but 22 are needed.*fewer --windows"):
-        train.cut_off(folder, 10)
+        recordings.cut_off(folder, 10)
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "readme.md").touch()
     with pytest.raises(RecordingError, match="notes: holds no HDF5 sequences"):
-        train.cut_off(tmp_path / "notes", 3)
+        recordings.cut_off(tmp_path / "notes", 3)
     (tmp_path / "set").mkdir()
     write_sequence(tmp_path / "set" / "a.h5", [Events.of([5], [1], [1], [1])],
                    [Picture(t, np.zeros((8, 8), np.uint8), None) for t in (0, 10_000)],
                    height=8, width=8)  # fmt: skip
     with pytest.raises(RecordingError, match="set: is a folder of HDF5 sequences, of which .* one"):
-        train.cut_off(tmp_path / "set", 3)
+        recordings.cut_off(tmp_path / "set", 3)
     write_folder(tmp_path / "both", 20)  # with what somebody made of it
     write_sequence(tmp_path / "both" / "a.h5", [Events.of([5], [1], [1], [1])],
                    [Picture(t, np.zeros((8, 8), np.uint8), None) for t in (0, 10_000)],
                    height=8, width=8)  # fmt: skip
-    assert train.cut_off(tmp_path / "both", 3).end > 0
+    assert recordings.cut_off(tmp_path / "both", 3).end > 0
     with pytest.raises(SettingsError, match="--near-events has no effect beside --voxel-noise"):
         tiny(tmp_path, data=(folder,), near_events=True, augment=Augment(voxel_noise=0.1))
-    assert train.cut_off(folder, 9).end == 10
+    assert recordings.cut_off(folder, 9).end == 10
     backwards = tmp_path / "backwards.h5"
     pictures = [Picture(t, np.zeros((8, 8), np.uint8), None) for t in (0, 20_000, 10_000)]
     write_sequence(backwards, [Events.of([5], [1], [1], [1])], pictures, height=8, width=8)
     with pytest.raises(RecordingError, match="frame 3: its time is 10000 us, not after 20000 us"):
-        train.cut_off(backwards, 1)
+        recordings.cut_off(backwards, 1)
     with pytest.raises(SettingsError, match="by one process"):
-        train.run(tiny(tmp_path / "run", data=(folder,), processes=2, process=0,
+        run(tiny(tmp_path / "run", data=(folder,), processes=2, process=0,
                        coordinator="127.0.0.1:1"))  # fmt: skip
 
 
@@ -126,7 +127,7 @@ def test_processes_of_a_launcher_do_not_write_the_same_files(tmp_path, folder, m
     monkeypatch.setenv("OMPI_COMM_WORLD_RANK", "1")
     monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", "2")
     with pytest.raises(SettingsError, match="by one process"):
-        train.run(tiny(tmp_path / "run", data=(folder,)))
+        run(tiny(tmp_path / "run", data=(folder,)))
     assert not (tmp_path / "run").exists()
 
 
@@ -154,7 +155,7 @@ def test_events_that_share_no_time_with_the_frames_are_said(tmp_path, events, sa
     times = range(0, 200_000, 10_000)
     path = write_pictures(tmp_path / "a.h5", times, events)
     with pytest.raises(RecordingError, match=f"{path}: {said}"):
-        train.run(tiny(tmp_path / "run", data=(path,), crop=16))
+        run(tiny(tmp_path / "run", data=(path,), crop=16))
     assert not list((tmp_path / "run").rglob("*.h5"))
 
 
@@ -170,26 +171,27 @@ def test_a_frame_of_another_size_is_said(tmp_path, number):
     (path / "events.txt").write_text(f"{SIZE} {SIZE}\n" + (path / "events.txt").read_text())
     said = f"{path}, frame {number + 1}: has 39x38 pixels, the sensor 40x40, expected the same"
     with pytest.raises(RecordingError, match=said):
-        train.run(tiny(tmp_path / "run", data=(path,)))
+        run(tiny(tmp_path / "run", data=(path,)))
     assert not list((tmp_path / "run").rglob("*.h5"))
     if number:  # the first is not judged, as no window ends there
         recording = open_recording(path)
-        one = train.Cut(recording, recording.frames, number - 1)
+        one = recordings.Cut(recording, recording.frames, number - 1)
         with pytest.raises(RecordingError, match=said):
-            train.judged(Weights(initial_params(jax.random.key(0)), True), one, near=False)
+            recordings.judged(Weights(initial_params(jax.random.key(0)), True), one, near=False)
 
 
 def test_a_run_keeps_to_its_recordings(tmp_path, folder):
     other = write_folder(tmp_path / "other", seed=1)
     settings = tiny(tmp_path / "run", data=(folder,))
-    train.write_sequences([train.cut_off(folder, 3)], settings)
+    recordings.write_sequences([recordings.cut_off(folder, 3)], settings)
     written = {path: path.stat().st_mtime_ns for path in settings.sequences.rglob("*.h5")}
-    train.write_sequences([train.cut_off(folder, 3)], settings)
+    recordings.write_sequences([recordings.cut_off(folder, 3)], settings)
     assert {p: p.stat().st_mtime_ns for p in settings.sequences.rglob("*.h5")} == written
     for data, windows in (((other,), 3), ((folder,), 5)):
         changed = dataclasses.replace(settings, data=data)
         with pytest.raises(OutputError, match="holds sequences of others"):
-            train.write_sequences([train.cut_off(path, windows) for path in data], changed)
+            cuts = [recordings.cut_off(path, windows) for path in data]
+            recordings.write_sequences(cuts, changed)
 
 
 @pytest.mark.parametrize(
@@ -199,7 +201,7 @@ def test_a_run_keeps_to_its_recordings(tmp_path, folder):
         ({"chain": 6}, "noise: has 17 frames to learn from, .* 18 windows in a row need 19"),
         ({"weights": "plus.npz"}, "plus.npz expects tensors that are not normalised"),
         ({"weights": "missing.npz"}, "missing.npz"),
-        ({"batch": 3}, "dealt out to 2 devices"),
+        ({"batch": 3}, "shared by 2 devices"),
     ],
 )
 def test_a_start_that_is_refused_writes_no_sequences(tmp_path, folder, monkeypatch, choices, said):
@@ -209,7 +211,7 @@ def test_a_start_that_is_refused_writes_no_sequences(tmp_path, folder, monkeypat
     save_weights("plus.npz", Weights(initial_params(jax.random.key(0)), normalise=False))
     settings = tiny(tmp_path / "run", data=(folder,), **choices)
     with pytest.raises(FirenetError, match=said):
-        train.run(settings)
+        run(settings)
     assert not settings.sequences.exists()
 
 
@@ -217,10 +219,10 @@ def test_no_sequences_are_written_into_the_folder_of_another_run(tmp_path, folde
     begun(tmp_path / "run", tiny(tmp_path / "run"))
     settings = tiny(tmp_path / "run", data=(folder,))
     with pytest.raises(OutputError, match="holds a run with other settings"):
-        train.run(settings)
+        run(settings)
     with locked(tmp_path / "run"), pytest.raises(OutputError, match="another run is writing it"):
         (tmp_path / "run/settings.json").unlink()
-        train.run(settings)
+        run(settings)
     assert not settings.sequences.exists()
 
 
@@ -304,9 +306,9 @@ def test_what_is_near_events_stays_so_through_a_chain(tmp_path):
 @pytest.mark.parametrize("warm", [10_000_000, 55_000])
 def test_the_end_is_judged_as_reconstruct_shows_it(folder, monkeypatch, warm):
     """Against the public functions, from the first window or from a later one on."""
-    monkeypatch.setattr(train, "WARM_UP", warm)
+    monkeypatch.setattr(recordings, "JUDGED_BEFORE", warm)
     weights = Weights(initial_params(jax.random.key(1)), True)
-    one = train.cut_off(folder, 5)  # frames 15 to 19 are judged
+    one = recordings.cut_off(folder, 5)  # frames 15 to 19 are judged
     begin = max(0, one.end - -(-warm // EVERY) + (warm % EVERY > 0))
     recording, times = one.recording, one.frames.times
     events = all_events(folder)
@@ -319,7 +321,7 @@ def test_the_end_is_judged_as_reconstruct_shows_it(folder, monkeypatch, warm):
         if n > one.end:
             truth = recording.frames.read(n) / np.float32(255)
             expected.append(float(metrics.ssim(np.clip(image[0, 0], 0, 1), truth)))
-    score = train.judged(weights, one, near=False)
+    score = recordings.judged(weights, one, near=False)
     assert score.frames == len(expected) == 5
     assert abs(score.ssim - np.mean(expected)) < 1e-5
 
@@ -329,11 +331,11 @@ def test_an_end_without_events_is_judged_by_nothing(tmp_path):
     path, events = tmp_path / "a.h5", Events.of([5, 79_000], [0, 0], [0, 0], [1, 1])
     write_sequence(path, [events], pictures, height=24, width=24)
     weights = Weights(initial_params(jax.random.key(1)), True)
-    one = train.cut_off(path, 3)
-    assert train.judged(weights, one, near=False).frames == 3
-    whole = train.judged(weights, one._replace(end=0), near=True)
+    one = recordings.cut_off(path, 3)
+    assert recordings.judged(weights, one, near=False).frames == 3
+    whole = recordings.judged(weights, one._replace(end=0), near=True)
     assert whole.frames == 0 and np.isnan(whole.ssim)  # the corner: no window of SSIM is there
-    assert train.judged(weights, one._replace(end=7), near=False).frames == 0
+    assert recordings.judged(weights, one._replace(end=7), near=False).frames == 0
 
 
 @pytest.mark.slow

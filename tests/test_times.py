@@ -153,7 +153,7 @@ def test_lists_are_read_more_than_once_so_they_are_no_pipes(tmp_path, recording)
 
 
 def test_a_file_that_is_not_there(tmp_path, recording):
-    with pytest.raises(RecordingError, match="cannot read this file of times"):
+    with pytest.raises(RecordingError, match="cannot read this list of times"):
         times_of(Times(at=tmp_path / "none.txt"), recording, recording.events())
 
 
@@ -194,9 +194,9 @@ def test_triggers(recording):
     [
         ({"rate": 30.0, "triggers": True}, "choose one of"),
         ({"rate": 0.0}, "rate is 0"),
-        ({"from_zero": True}, "--from-zero says more of --rate"),
-        ({"unit": "s"}, "--unit says more of --at"),
-        ({"trigger_input": 0}, "--trigger-input says more of --triggers"),
+        ({"from_zero": True}, "--from-zero has no effect without --rate"),
+        ({"unit": "s"}, "--unit has no effect without --at"),
+        ({"trigger_input": 0}, "--trigger-input has no effect without --triggers"),
     ],
 )
 def test_impossible_choices(choice, said):

@@ -22,7 +22,8 @@ from firenet_jax.events import Events
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.simulation.curricula import window_bounds
 from firenet_jax.simulation.scenes import SceneSettings
-from firenet_jax.simulation.sensor import FAULTY, SensorSettings, Simulation, simulate
+from firenet_jax.simulation.sensor import FAULTY, SensorSettings
+from firenet_jax.simulation.sequences import Simulation, simulate
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.storage.files import locked
 from firenet_jax.storage.sequence_file import Picture, write_sequence
@@ -151,7 +152,7 @@ def test_one_of_several_processes_ends_when_it_is_told_to():
 
 def test_a_batch_that_devices_cannot_share_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(jax, "device_count", lambda: 3)
-    with pytest.raises(ValueError, match="dealt out to 3 devices"):
+    with pytest.raises(ValueError, match="shared by 3 devices"):
         run(tiny(tmp_path))
 
 
@@ -555,17 +556,17 @@ def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypa
         ({"log_every": 0}, "log_every"), ({"validate_every": 0}, "validate_every"),
         ({"crop": 10}, "smaller than 11"), ({"procedural": 3.0}, "procedural"),
         ({"slow": 0.5, "swift": 0.5}, "slow is 0.5 and swift is 0.5"),
-        ({"to_and_fro": 1.5}, "to_and_fro is 1.5, but is a part of the sequences"),
+        ({"to_and_fro": 1.5}, "to_and_fro is 1.5, but must be a share of the sequences"),
         ({"to_and_fro": 0.5, "windows": 3}, "windows is 3, but as many lead to and fro"),
         ({"motion": (2.0, 5.5)}, "5.5 pixels of motion need 6 renderings, not 5"),
         ({"crop": 16, "loss": Loss(cw_ssim=1, l0=1)}, "--cw-ssim needs 17 or more"),
         ({"chain": 2400}, "2400 steps of 3 windows, .* at most 7158 windows"),
         ({"motion": (0.0, 2.0)}, "motion is 0 2"), ({"motion": (2.0, 1.0)}, "the least first"),
         ({"data": (Path("a"),), "images": Path("b"), "scene": SceneSettings(shake=0.5)},
-         "^images, shake: no part in training on sequences from --data"),
-        ({"augment": Augment(hot_pixels=0)}, "^hot-pixels: no part in training on simulated"),
-        ({"images": Path("p"), "procedural": 1.0}, "^images: no part in training on procedural"),
-        ({"sensor": SensorSettings(cutoff_dark=0.5)}, "--cutoff-dark says more of --cutoff"),
+         "^images, shake: no effect with training on sequences from --data"),
+        ({"augment": Augment(hot_pixels=0)}, "^hot-pixels: no effect with training on simulated"),
+        ({"images": Path("p"), "procedural": 1.0}, "^images: no effect with training on proced"),
+        ({"sensor": SensorSettings(cutoff_dark=0.5)}, "--cutoff-dark has no effect without --cut"),
         ({"seed": -3}, "seed is -3"), ({"seed": 5_000_000_000}, "less than 2"),
     ],
 )  # fmt: skip

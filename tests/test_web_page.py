@@ -349,7 +349,9 @@ def test_a_page_without_its_runtime_says_what_to_install(tmp_path, capsys, monke
     monkeypatch.chdir(tmp_path)
     code, _, error = firenet(capsys, "export --web page")
     assert code == 1 and "npm install onnxruntime-web" in error and error.count("\n") == 1
-    with pytest.raises(SettingsError, match="runtime, sample: no part in an export without --web"):
+    with pytest.raises(
+        SettingsError, match="runtime, sample: no effect with an export without --web"
+    ):
         Export(output=Path("a.onnx"), runtime=tmp_path, sample=tmp_path)
     assert not list(tmp_path.iterdir())
     runtime = tmp_path / "node_modules" / "onnxruntime-web"
@@ -448,7 +450,10 @@ def test_a_page_is_not_written_beside_a_file_that_cannot_be(tmp_path, capsys, ru
         ("-o new.pth --picture", "new.pth holds weights alone"),
         ("-o there.onnx", "there.onnx exists"),
         ("-o a.doc", "cannot write .doc files"),
-        ("--picture --no-normalise", "normalise, picture: no part in an export without --output"),
+        (
+            "--picture --no-normalise",
+            "normalise, picture: no effect with an export without --output",
+        ),
     ]:
         code, _, error = firenet(capsys, f"export --web page --sample a.txt {line}")
         assert code == 1 and said in error and not (tmp_path / "page").exists()
@@ -459,7 +464,7 @@ def test_a_sample_whose_size_is_said(tmp_path, capsys, runtime):
     with np.load(tmp_path / "page" / "sample.npz") as sample:
         assert (sample["width"], sample["height"]) == (33, 32)
     code, _, error = firenet(capsys, "export --web other --sensor-size 33x32")
-    assert code == 1 and "sensor-size: no part in an export without --sample" in error
+    assert code == 1 and "sensor-size: no effect with an export without --sample" in error
 
 
 @pytest.mark.slow

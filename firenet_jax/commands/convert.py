@@ -7,7 +7,8 @@ from typing import Annotated
 import jax
 import tyro
 
-from firenet_jax.checkpoint import BUILT_IN, CheckpointError, convert, save_weights
+from firenet_jax.checkpoint import BUILT_IN, convert, save_weights
+from firenet_jax.errors import CheckpointError, OutputError
 from firenet_jax.storage.files import check_no_pipe
 from firenet_jax.storage.video import followed
 
@@ -32,7 +33,7 @@ class Convert:
 
 def run(settings: Convert) -> None:
     if settings.output.exists() and not settings.overwrite:
-        raise CheckpointError(f"{settings.output} exists; choose another name or pass --overwrite")
+        raise OutputError(f"{settings.output} exists: choose another output or pass --overwrite")
     given = settings.checkpoint
     if str(given) == BUILT_IN or given.is_dir() or given.suffix == ".npz":
         raise CheckpointError(

@@ -20,20 +20,27 @@ from firenet_jax.checkpoint import load_weights
 from firenet_jax.errors import OutputError, SettingsError
 from firenet_jax.evaluation.metrics import mse, ssim, temporal_error
 from firenet_jax.network import Weights, initial_state
-from firenet_jax.pictures import DisplayState, display, event_pictures, initial_display_state
+from firenet_jax.pictures import (
+    DisplayState,
+    display,
+    event_pictures,
+    initial_display_state,
+    to_8_bit,
+)
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.settings import check_seed, parse_size
 from firenet_jax.simulation.scenes import Scene, SceneSettings, random_scene
-from firenet_jax.simulation.sensor import FAULTY, Sensor, SensorSettings, random_sensor, simulate
+from firenet_jax.simulation.sensor import FAULTY, Sensor, SensorSettings, random_sensor
+from firenet_jax.simulation.sequences import simulate
 from firenet_jax.simulation.textures import HELD_OUT, load_textures, photographs
-from firenet_jax.storage.overlap import ahead
+from firenet_jax.storage.overlap import prefetch
 from firenet_jax.storage.progress import bar
 from firenet_jax.storage.resume import position_file
 from firenet_jax.storage.video import check_output, followed, open_writer
 
 WINDOWS_AT_ONCE = 10  # simulated and reconstructed at once
 RENDERINGS = 5  # in a window, with at most half a pixel of motion between two
-WARM_UP = 10  # windows from a zero state that the numbers leave out
+UNSCORED = 10  # windows from a zero state that the numbers leave out
 CAPTION = 16  # pixels above the pictures
 
 
@@ -106,8 +113,8 @@ def run(settings: Demo) -> dict[str, float]:
     sensor, scene = make_scene(settings, height, width)
     writer = open_writer(output, settings.fps)
     errors = np.zeros(3)
-    warm_up = min(WARM_UP, count - 1)
-    shown = ahead(pictures(weights, sensor, scene, count, period, height, width), depth=1)
+    warm_up = min(UNSCORED, count - 1)
+    shown = prefetch(pictures(weights, sensor, scene, count, period, height, width), depth=1)
     try:
         caption = captions(["events", "reconstruction", "truth"], width)
         with bar(count, "pictures") as progress:
@@ -195,7 +202,7 @@ def _show(simulated, images, last, ranges: DisplayState):
     errors = [mse(clipped, truth), ssim(clipped, truth)]
     errors.append(temporal_error(clipped, previous, displacement, truth, previous_truth, visible))
     numbers = jnp.stack(errors, -1)
-    eight_bit = jnp.round(jnp.clip(255 * truth, 0, 255)).astype(jnp.uint8)
+    eight_bit = to_8_bit(truth)
     shown = Shown(event_pictures(tensors), greys[:, 0], eight_bit, numbers)
     return (clipped[-1], truth[-1]), ranges, shown
 

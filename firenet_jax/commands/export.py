@@ -11,17 +11,17 @@ import tyro
 
 from firenet_jax.checkpoint import BUILT_IN, load_weights
 from firenet_jax.commands.demo import Demo, make_scene
-from firenet_jax.errors import RecordingError
+from firenet_jax.errors import OutputError, RecordingError
 from firenet_jax.events import Events, concatenate
 from firenet_jax.export.onnx_model import onnx_model
 from firenet_jax.export.stablehlo import stablehlo
-from firenet_jax.export.tensors_file import pth, safetensors
 from firenet_jax.export.web_page import RUNTIME, runtime_version, write_page
+from firenet_jax.export.weights_file import pth, safetensors
 from firenet_jax.readers import open_recording
 from firenet_jax.settings import check_none_idle, parse_size
 from firenet_jax.simulation.scenes import rendering_times, video
 from firenet_jax.simulation.sensor import event_list
-from firenet_jax.storage.files import OutputError, partial_name, write_bytes
+from firenet_jax.storage.files import partial_name, write_bytes
 from firenet_jax.storage.video import followed
 
 SIMULATED = 120, 160  # height, width
@@ -93,7 +93,7 @@ def write_web(folder: Path, settings: Export) -> None:
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder} is a file: choose another name for the folder")
     if folder.exists() and not settings.overwrite and any(folder.iterdir()):
-        raise OutputError(f"{folder} exists; choose another name or pass --overwrite")
+        raise OutputError(f"{folder} exists: choose another output or pass --overwrite")
     version = runtime_version(settings.runtime)
     weights = load_weights(settings.weights)
     if settings.sample is None:
@@ -141,7 +141,7 @@ def check_file(path: Path, settings: Export) -> None:
     if path.is_dir():
         raise OutputError(f"{path} is a folder: choose another name for the file")
     if path.exists() and not settings.overwrite:
-        raise OutputError(f"{path} exists; choose another name or pass --overwrite")
+        raise OutputError(f"{path} exists: choose another output or pass --overwrite")
     partial_name(followed(path))  # refuses some names
 
 

@@ -16,7 +16,7 @@ from firenet_jax.filters import hot_pixels_of
 from firenet_jax.readers import open_recording
 from firenet_jax.settings import parse_size
 from firenet_jax.storage.progress import Bytes, bar
-from firenet_jax.windows import cut, usual
+from firenet_jax.windows import USUAL_DENSITY, cut, usual
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,7 @@ def describe(
     def events():
         nonlocal counts, on, first, last
         for chunk in recording.events():
-            pixels = chunk.y.astype(np.int64) * recording.width + chunk.x
-            counts += np.bincount(pixels, minlength=counts.size)
+            counts += np.bincount(chunk.flat_index(recording.width), minlength=counts.size)
             on += int(chunk.p.sum())
             first = int(chunk.t[0]) if first is None else first
             last = int(chunk.t[-1])
@@ -121,7 +120,7 @@ def run(settings: Info) -> None:
         if inputs
         else "none",
         "hot pixels": f"{len(hot)}" + (f", (x,y): {shown}" if hot else ""),
-        "window": f"{facts['events_per_window']:,} events (0.35 per pixel), at most "
+        "window": f"{facts['events_per_window']:,} events ({USUAL_DENSITY} per pixel), at most "
         f"{facts['longest_window_ms']:g} ms: {counted(facts['windows'], 'image')}",
     }
     print(facts["recording"])

@@ -26,7 +26,7 @@ import numpy as np
 from tqdm import tqdm
 
 from firenet_jax.devices import BATCH, REPLICATED, device_mesh, sharding
-from firenet_jax.errors import RecordingError, SettingsError, logger
+from firenet_jax.errors import OutputError, RecordingError, SettingsError, logger
 from firenet_jax.events import Events, Recording, counted
 from firenet_jax.instants import Counts, Grid, Step, steps, warming
 from firenet_jax.network import Weights
@@ -42,8 +42,8 @@ from firenet_jax.reconstruction import (
 from firenet_jax.storage import resume
 from firenet_jax.storage.arrays import ArraysWriter
 from firenet_jax.storage.bag import BagWriter
-from firenet_jax.storage.files import OutputError, no_note
-from firenet_jax.storage.overlap import ahead
+from firenet_jax.storage.files import no_note
+from firenet_jax.storage.overlap import prefetch
 from firenet_jax.storage.progress import Bytes
 from firenet_jax.storage.screen import Screen
 from firenet_jax.storage.video import FolderWriter, VideoWriter
@@ -73,7 +73,7 @@ class Way(NamedTuple):
     network: Network = Network()
     display: Display = Display()
     preview: bool = False
-    turned: bool = False  # the events are rotated by 180 degrees
+    rotated: bool = False  # the events are rotated by 180 degrees
     raw: bool = False  # write the network's float32 images
     at_times: bool = False  # images at given times
     chunk: int | None = None  # steps of a recording per call of the device; None: `chunk_for`
@@ -144,16 +144,16 @@ class Running:
         self.reached += len(taken)
         self.pictures += sum(step.time is not None for step in taken)
         if self.ahead is None and self.error is None and self.counts is not None:
-            self.error = told(self.job.recording, self.counts)
+            self.error = check_coverage(self.job.recording, self.counts)
         return taken
 
 
-def told(recording: Recording, counts: Counts) -> RecordingError | None:
+def check_coverage(recording: Recording, counts: Counts) -> RecordingError | None:
     """Says which times lie outside the recording; an error where all do."""
     if not counts.seen:
         return RecordingError(
-            f"{recording.path}: no image is wanted while it lasts ({counts.outside}): choose other "
-            "times"
+            f"{recording.path}: none of the requested times lies within it ({counts.outside}): "
+            "choose other times"
         )
     if counts.early or counts.late:
         logger.warning("%s: times without an image: %s", recording.path, counts.outside)
@@ -195,9 +195,9 @@ def do_jobs(
     devices = min(wanted, jax.local_device_count())
     slots = -(-wanted // devices) * devices  # the same number on each device; some may stay empty
     opened: dict[Path, Writer] = {}  # of jobs that are not done
-    chunks = ahead(in_chunks(jobs, way, slots, devices, outcome, opened), depth=1)
+    chunks = prefetch(in_chunks(jobs, way, slots, devices, outcome, opened), depth=1)
     pictures_of = computed(chunks, jobs[0].recording, way, weights, slots, devices)
-    finished = ahead(pictures_of, depth=1, broken=outcome.stopped)
+    finished = prefetch(pictures_of, depth=1, broken=outcome.stopped)
     screen, pictures = Screen() if show else None, 0
     warming = any(job.warm_up for job in jobs)
     try:
@@ -373,7 +373,7 @@ def computed(
             )
         session, shown = events_to_pictures(
             weights, session, events, chunk.valid, chunk.looks, height=height, width=width,
-            network=way.network, settings=way.display, preview=way.preview, turned=way.turned,
+            network=way.network, settings=way.display, preview=way.preview, rotated=way.rotated,
             raw=way.raw, mesh=mesh,
         )  # fmt: skip
         states = {}

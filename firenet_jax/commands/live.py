@@ -14,15 +14,15 @@ import tyro
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.events import Events, counted
-from firenet_jax.filters import read_hot_pixels, turned
+from firenet_jax.filters import read_hot_pixels, rotated
 from firenet_jax.live import sources
-from firenet_jax.live.engine import Figures, Limits, cooled, pictures
+from firenet_jax.live.engine import Figures, Limits, pictures, without_hot_pixels
 from firenet_jax.live.page import Board, serve
 from firenet_jax.pictures import Display
 from firenet_jax.readers import open_recording
 from firenet_jax.settings import check_none_idle, check_sizes, parse_size
 from firenet_jax.storage.screen import Screen
-from firenet_jax.windows import DEFAULT_LONGEST, Windows
+from firenet_jax.windows import DEFAULT_LONGEST, USUAL_DENSITY, Windows
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Live:
     wire: Literal["t64_x16_y16_on8", "t32_x16_y15_on1", "text"] = "t64_x16_y16_on8"
     """Wire format of a stream: 13 or 8 bytes per event (both as faery sends them), or a line of
     text."""
-    events_per_pixel: float = 0.35
+    events_per_pixel: float = USUAL_DENSITY
     """Events per window and pixel of the sensor."""
     longest: float = DEFAULT_LONGEST
     """Longest duration of a window in milliseconds."""
@@ -138,8 +138,8 @@ def prepared(settings: Live, height: int, width: int) -> Callable:
 
     def prepare(arrivals: Iterator[Events]) -> Iterator[Events]:
         if settings.hot_pixels is not None:
-            arrivals = cooled(arrivals, height, width, hot)
-        return turned(arrivals, height, width) if settings.flip else arrivals
+            arrivals = without_hot_pixels(arrivals, height, width, hot)
+        return rotated(arrivals, height, width) if settings.flip else arrivals
 
     return prepare
 

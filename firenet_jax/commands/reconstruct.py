@@ -20,8 +20,8 @@ from firenet_jax import filters
 from firenet_jax.checkpoint import load_weights
 from firenet_jax.commands.jobs import Done, Job, Outcome, Way, Writer, do_jobs
 from firenet_jax.commands.times import Times, times_of
-from firenet_jax.devices import share
-from firenet_jax.errors import RecordingError, SettingsError, logger
+from firenet_jax.devices import process_of
+from firenet_jax.errors import OutputError, RecordingError, SettingsError, logger
 from firenet_jax.events import Events, Recording, counted, rate_in_words, until_damage
 from firenet_jax.instants import WARM_UP, Grid, check
 from firenet_jax.network import Weights
@@ -32,7 +32,7 @@ from firenet_jax.settings import check_none_idle, check_sizes, parse_size
 from firenet_jax.storage import video
 from firenet_jax.storage.arrays import ArraysWriter
 from firenet_jax.storage.bag import BagWriter, check_topic
-from firenet_jax.storage.files import OutputError, check_apart, identity, named
+from firenet_jax.storage.files import check_apart, identity, named
 from firenet_jax.storage.overlap import until_set
 from firenet_jax.storage.progress import Bytes, bar
 from firenet_jax.storage.resume import done_file, is_done, read_position
@@ -74,9 +74,9 @@ class Reconstruct:
     display: Display = Display()
     network: Network = Network()
     warm_up: int = WARM_UP
-    """First show the network this many windows of the beginning, forwards and then backwards in
-    time, so that it starts with a picture; fewer beyond 0.4 events per pixel on the mean. 0: it
-    starts with nothing, and grey, as in the paper."""
+    """Before the first picture, run the network over this many windows of the beginning, forwards
+    and then backwards in time, so that the first pictures are not grey; over fewer, if they hold
+    more than 0.4 events per pixel on average. 0: start from a zero state, as in the paper."""
     preview: bool = False
     """Show the events (blue: brighter, red: darker) next to the reconstruction."""
     show: bool = False
@@ -147,7 +147,7 @@ class Reconstruct:
         if not self.recordings:
             raise SettingsError("no recording: name one or more files or folders")
         filters.check_span(self.start, self.stop)
-        share(self.process, self.processes)
+        process_of(self.process, self.processes)
         check_topic(self.topic)
         if self.times.wanted:
             check(self.windows)
@@ -187,7 +187,7 @@ def run(settings: Reconstruct) -> list[Path]:
         check_screen()
     # Recordings are independent, so the processes do not use jax.distributed: there, a process that
     # ends or dies would stop the others.
-    process, processes = share(settings.process, settings.processes)
+    process, processes = process_of(settings.process, settings.processes)
     mine = slice(process, None, processes)
     planned = plan(settings.recordings, settings.output)
     for path in settings.recordings:  # a slip, not damage: before all, and before folders are made
@@ -225,7 +225,7 @@ def do_all(jobs: list[Job], settings: Reconstruct, weights: Weights, outcome: Ou
         network=settings.network,
         display=settings.display,
         preview=settings.preview,
-        turned=settings.flip and settings.network.color,  # else it would compile anew
+        rotated=settings.flip and settings.network.color,  # else it would compile anew
         raw=settings.output.suffix == ".h5",
         at_times=settings.times.wanted,
         chunk=settings.chunk,
@@ -366,9 +366,9 @@ def filtered(
     """hot: its hot pixels, which are found when the first event is asked for."""
     chunks = part_of(recording, settings)
     if (pixels := hot()) is not None:
-        chunks = filters.without(chunks, pixels)
+        chunks = filters.without_hot_pixels(chunks, pixels)
     if settings.flip:
-        chunks = filters.turned(chunks, recording.height, recording.width)
+        chunks = filters.rotated(chunks, recording.height, recording.width)
     yield from chunks
 
 

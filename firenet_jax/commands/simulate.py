@@ -20,7 +20,7 @@ import jax
 import numpy as np
 import tyro
 
-from firenet_jax.devices import share
+from firenet_jax.devices import process_of
 from firenet_jax.errors import OutputError, PictureError, SettingsError
 from firenet_jax.events import Events, counted
 from firenet_jax.settings import check_none_idle, check_seed, parse_size
@@ -50,7 +50,7 @@ from firenet_jax.storage.files import (
     remove_left,
     write_text,
 )
-from firenet_jax.storage.overlap import ahead
+from firenet_jax.storage.overlap import prefetch
 from firenet_jax.storage.progress import bar
 from firenet_jax.storage.sequence_file import Picture, write_sequence
 from firenet_jax.storage.video import followed
@@ -132,7 +132,7 @@ class Simulate:
             )
         check_seed(self.seed)
         parse_size(self.sensor_size)
-        share(self.process, self.processes)
+        process_of(self.process, self.processes)
         check_idle(with_faults(self.sensor) if self.faults else self.sensor)
         if self.video is not None:
             names = [*OF_SCENES, "process", "processes"]
@@ -156,8 +156,8 @@ class Simulate:
 def run(settings: Simulate) -> list[Path]:
     """Does what the settings say; returns the files, those of an earlier run included. Raises
     a FirenetError with a message of one sentence."""
-    process, processes = share(settings.process, settings.processes)
-    if settings.video is not None:  # which is not dealt out
+    process, processes = process_of(settings.process, settings.processes)
+    if settings.video is not None:  # which processes do not share
         return [] if process else [simulate_clip(settings, settings.video)]
     height, width = parse_size(settings.sensor_size or "240x180")
     folder = settings.output
@@ -289,8 +289,8 @@ def sequence(
     bounds = np.append(times, round(1e6 * settings.seconds))
     longest = {} if camera.lamp is None else {"longest": FLICKER_INTERVAL}
     renderings = video(scene, rendering_times(scene, bounds, **longest, **size), **size)
-    events = ahead(event_list(camera, renderings), depth=64)
-    return events, ahead(_pictures(scene, times, settings.fps, height, width), depth=4)
+    events = prefetch(event_list(camera, renderings), depth=64)
+    return events, prefetch(_pictures(scene, times, settings.fps, height, width), depth=4)
 
 
 def _pictures(scene: Scene, times: np.ndarray, fps: float, height, width) -> Iterator[Picture]:
@@ -406,7 +406,7 @@ def simulate_clip(settings: Simulate, clip: Path) -> Path:
 
     record = {k: v for k, v in describe(settings).items() if k not in OF_SCENES}
     record |= {"video": clip.name, "sensor_size": f"{width}x{height}"}
-    events = ahead(event_list(camera, renderings()), depth=4)
+    events = prefetch(event_list(camera, renderings()), depth=4)
     count = write_sequence(path, events, read_clip(clip, size), settings=record, **sides)
     warn_if_cut(clip, last)
     print(f"{path}: {count:,} events of {width}x{height} pixels")

@@ -19,7 +19,8 @@ from firenet_jax.errors import RecordingError, SettingsError, logger
 from firenet_jax.events import MAX_TIME, Events, Recording, counted
 from firenet_jax.instants import Grid, check_rate, grid
 from firenet_jax.readers import text
-from firenet_jax.storage.files import check_no_pipe
+from firenet_jax.settings import check_refined
+from firenet_jax.storage.files import read_lines
 
 UNITS = {"s": 10**6, "ms": 10**3, "us": 1, "ns": Decimal("0.001")}  # microseconds
 UNIT_OF = {name: names[0] for names in text.UNITS.values() for name in names}
@@ -29,7 +30,13 @@ COLUMN = re.compile(r"t|time|timestamps?|stamps?")  # without its unit
 NAME = re.compile(r"""(?<![\w.:+-])(?!(?:nan|inf)\b)[a-z_][a-z_0-9]*(?:[\s,;:\[("']|$)""")
 NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d{1,4000})?)\s*([a-zµμ]*)", re.IGNORECASE)
 SPLIT = re.compile(r"[\s,;]+")
-LARGEST = 1 << 28  # bytes of a file of times
+REFINED = {
+    "from_zero": "rate",
+    "unit": "at",
+    "since": "at",
+    "trigger_edges": "triggers",
+    "trigger_input": "triggers",
+}
 
 
 @dataclass(frozen=True)
@@ -66,15 +73,7 @@ class Times:
             )
         if self.rate is not None:
             check_rate(self.rate)
-        for name, given, needed, needs in (
-            ("from-zero", self.from_zero, "rate", self.rate),
-            ("unit", self.unit, "at", self.at),
-            ("since", self.since, "at", self.at),
-            ("trigger-edges", self.trigger_edges != "rising", "triggers", self.triggers),
-            ("trigger-input", self.trigger_input is not None, "triggers", self.triggers),
-        ):
-            if given and not needs:
-                raise SettingsError(f"--{name} says more of --{needed}, which is not asked for")
+        check_refined(self, REFINED)
 
     @property
     def wanted(self) -> bool:
@@ -199,16 +198,8 @@ def whole_numbers(numbers: list[str]) -> bool:
 def read_times(path: Path) -> tuple[list[str], str | None, bool | None]:
     """A file -> (numbers as written, unit, whether they count from the start); None for what it
     does not state. Raises RecordingError, which names the invalid line."""
-    check_no_pipe(path, RecordingError)
-    try:
-        if path.stat().st_size > LARGEST:
-            raise RecordingError(f"{path}: is larger than {LARGEST >> 20} MB: no list of times")
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text"
-        raise RecordingError(f"{path}: cannot read this file of times: {reason}") from error
     numbers, unit, since_start, column = [], None, None, 0
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(read_lines(path, "list of times"), 1):
         line = line.strip()
         if not line:
             continue

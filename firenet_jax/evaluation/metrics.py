@@ -196,6 +196,7 @@ def ssim_where(image: jax.Array, truth: jax.Array, there: jax.Array) -> jax.Arra
 
 SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 WINDOW = 11  # pixels of the window of SSIM at sigma 1.5
+CW_SSIM_SIDE = 17  # pixels of the least side, so that there are 4x4 responses
 
 
 def ms_ssim_scales(height: int, width: int) -> int:
@@ -447,7 +448,7 @@ def cw_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     The original has a steerable pyramid.
     Tolerates shifts of a pixel or two. Blind to a negative and to offsets.
     """
-    least = 17  # pixels, for 4x4 responses
+    least = CW_SSIM_SIDE
     _check_sides(image, least, "CW-SSIM needs")
     scales = sum(min(image.shape[-2:]) >> scale >= least for scale in range(3))
     similarity = jnp.float32(0)

@@ -34,14 +34,23 @@ from firenet_jax.evaluation.comparison import (
 )
 from firenet_jax.evaluation.equalise import Kind
 from firenet_jax.evaluation.methods import Method, look
+from firenet_jax.evaluation.metrics import CW_SSIM_SIDE
 from firenet_jax.evaluation.results import Measured
 from firenet_jax.events import Frames, Recording
 from firenet_jax.filters import check_span
 from firenet_jax.instants import Step, steps
 from firenet_jax.settings import check_seed, check_sizes
 from firenet_jax.storage.files import named
-from firenet_jax.storage.overlap import ahead
-from firenet_jax.windows import Window, Windows, cut, in_words, usual
+from firenet_jax.storage.overlap import prefetch
+from firenet_jax.windows import (
+    DEFAULT_LONGEST,
+    USUAL_DENSITY,
+    Window,
+    Windows,
+    cut,
+    in_words,
+    usual,
+)
 
 # Seconds from the beginning of the Event Camera Dataset's sequences (EVREAL's; one of E2VID's
 # authors gave the same in rpg_e2vid's issue 17).
@@ -54,7 +63,6 @@ CUTS = {
     "shapes_6dof": (5.0, 20.0),
     "slider_depth": (1.0, 2.5),
 }
-MIN_SIDE = 17  # pixels of a side: what CW-SSIM's filters need
 
 
 @dataclass(frozen=True)
@@ -102,16 +110,13 @@ class Protocol:
 
     def in_words(self) -> list[str]:
         """What is done, in sentences, for people who read a table."""
-        if self.windows.frame_to_frame:
-            windows = "windows between frames"
-        elif self.windows.events is not None:
-            windows = f"windows of {self.windows.events} events"
-        elif self.windows.duration is not None:
-            windows = f"windows of {self.windows.duration:g} ms"
-        else:
+        if self.windows == Windows():
             windows = (
-                "windows of 0.35 events per pixel, at most 40 ms or a twentieth of a recording"
+                f"windows of {USUAL_DENSITY} events per pixel, at most {DEFAULT_LONGEST:g} ms or "
+                "a twentieth of a recording"
             )
+        else:  # none of a protocol's depends on the sensor
+            windows = in_words(self.windows, pixels=0)
         if self.images_at is not None:
             windows = (
                 f"{self.images_at}, each from an extra step whose state is discarded; the state by "
@@ -146,7 +151,7 @@ def plan(name: str, recording: Recording, protocol: Protocol) -> Plan:
         raise Gap(
             f"frames are {width}x{height}, the sensor is {recording.width}x{recording.height}"
         )
-    if min(height, width) < MIN_SIDE:
+    if min(height, width) < CW_SSIM_SIDE:
         raise Gap(f"{width}x{height} pixels are too small to be compared")
     times = np.asarray(frames.times, np.int64)
     if (np.diff(times) < 0).any():
@@ -263,7 +268,7 @@ def evaluate(
     Raises Gap where no prediction counts or an image is not finite.
     """
     began, before = time.monotonic(), progress.n
-    entries = ahead(iter(steps_of(plan)), depth=4)
+    entries = prefetch(iter(steps_of(plan)), depth=4)
     tolerance = protocol.tolerated
     latest = int(plan.times[plan.last - 1]) + tolerance
     empty = 0

@@ -40,8 +40,8 @@ class Shown(NamedTuple):
 
 def event_picture(events: Events, height: int, width: int) -> np.ndarray:
     """(H, W, 3) uint8, on white: blue where most of a pixel's events say brighter, red darker."""
-    places = events.y.astype(np.int64) * width + events.x
-    votes = np.bincount(places, np.where(events.p, 1.0, -1.0), height * width)
+    signs = np.where(events.p, 1.0, -1.0)
+    votes = np.bincount(events.flat_index(width), signs, height * width)
     picture = np.full((height * width, 3), 255, np.uint8)
     picture[votes > 0], picture[votes < 0] = (0, 0, 255), (255, 0, 0)
     return picture.reshape(height, width, 3)

@@ -2,13 +2,13 @@
 
     onnx_model    Weights -> ONNX graph of a step: onnxruntime, TensorRT, OpenVINO, browsers
     stablehlo     Weights -> a step as JAX exports it: any process with jax, any platform
-    tensors_file  Weights -> .pth or .safetensors, under the names of the original programs
+    weights_file  Weights -> .pth or .safetensors, under the names of the original programs
     web_page      Weights -> a folder that a browser shows: a recording becomes video there
 
 Read `onnx_model` first. The libraries that write come with the extra `export`.
 """
 
-from firenet_jax.storage.files import OutputError
+from firenet_jax.errors import OutputError
 
 
 def missing(library: str) -> OutputError:

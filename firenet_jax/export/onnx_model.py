@@ -12,8 +12,9 @@ Operators: onnx.ai/onnx/operators, opset 17 (2022), all of them also in the brow
 
 import numpy as np
 
+from firenet_jax.events import BINS
 from firenet_jax.export import missing
-from firenet_jax.network import BINS, CHANNELS, Weights
+from firenet_jax.network import CHANNELS, Weights
 from firenet_jax.pictures import Display, unsharp_kernel
 
 TO_UINT8 = 2  # TensorProto.UINT8

@@ -17,8 +17,9 @@ import jax
 import jax.numpy as jnp
 from jax import export
 
+from firenet_jax.events import BINS
 from firenet_jax.export import missing
-from firenet_jax.network import BINS, CHANNELS, State, Weights
+from firenet_jax.network import CHANNELS, State, Weights
 from firenet_jax.pictures import Display, display
 from firenet_jax.reconstruction import reconstruct
 

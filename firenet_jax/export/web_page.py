@@ -18,10 +18,11 @@ from typing import Any
 
 import numpy as np
 
+from firenet_jax.errors import OutputError
 from firenet_jax.events import Events
 from firenet_jax.export.onnx_model import onnx_model
 from firenet_jax.network import Weights
-from firenet_jax.storage.files import OutputError, writing
+from firenet_jax.storage.files import writing
 
 RUNTIME = "onnxruntime-web"
 # Both ways to run: on a GPU, and where there is none.

@@ -71,7 +71,7 @@ class Figures:
         }
 
 
-def sound(
+def valid_events(
     arrivals: Iterable[Events], height: int, width: int, figures: Figures
 ) -> Iterator[Events]:
     """Passes on what can be events of this sensor, in order of time; counts the rest.
@@ -112,7 +112,7 @@ def sound(
         yield events
 
 
-def cooled(
+def without_hot_pixels(
     arrivals: Iterable[Events], height: int, width: int, hot: np.ndarray | None = None
 ) -> Iterator[Events]:
     """Leaves out the events of hot pixels, (H, W) bool. Empty arrivals stay: they tell the time.
@@ -236,7 +236,7 @@ def pictures(
     jax.block_until_ready(compute(session, Events.empty()))  # compiled before the first event
 
     waiting = Waiting(limits.behind, figures)
-    arrivals = prepare(sound(source.arrivals, height, width, figures))
+    arrivals = prepare(valid_events(source.arrivals, height, width, figures))
     cut = windows(arrivals, limits.count, limits.longest, speed=limits.speed)
     reading = threading.Thread(target=waiting.fill, args=(cut,), daemon=True)
     reading.start()

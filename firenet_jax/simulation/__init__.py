@@ -2,7 +2,8 @@
 
     textures       photographs, cut at random, and drawn ones
     scenes         textures and motion -> intensity at any time, with exact flow
-    sensor         intensity -> events, or event tensors that never leave the device
+    sensor         intensity -> events
+    sequences      sensors before scenes -> event tensors and truth, which never leave the device
     curricula      which sensors look at which scenes: the sequences of a training
     clip           a video file -> grey pictures, the sensor's input in place of a scene
 

@@ -16,13 +16,8 @@ import jax.numpy as jnp
 
 from firenet_jax.errors import SettingsError
 from firenet_jax.simulation.scenes import Scene, SceneSettings, log_uniform, random_scene
-from firenet_jax.simulation.sensor import (
-    Sensor,
-    SensorSettings,
-    Simulation,
-    random_sensor,
-    simulate,
-)
+from firenet_jax.simulation.sensor import Sensor, SensorSettings, random_sensor
+from firenet_jax.simulation.sequences import Simulation, simulate
 
 SLOW, SWIFT = (0.02, 0.3), (16.0, 90.0)  # pixels per window, in slow and swift sequences
 # Slow sequences have this many times the mismatch, so that the pixels of an edge fire one by one.

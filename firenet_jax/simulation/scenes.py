@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.errors import SettingsError
-from firenet_jax.settings import check_none_idle, check_range
+from firenet_jax.settings import check_none_idle, check_range, check_refined, check_share
 from firenet_jax.warp import sample
 
 WAVES = 3  # sinusoids in each of the six coordinates of a motion
@@ -93,20 +93,14 @@ class SceneSettings:
         for name in ("speed", "shake_pixels", "zoom", "blur", "size", "softness", "gamma"):
             check_range(name, getattr(self, name))
         for name in ("pause", "halt", "shake", "still", "plain", "hdr"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise SettingsError(
-                    f"{name} is {getattr(self, name)}, but is a probability, 0 to 1"
-                )
+            check_share(name, getattr(self, name), of="scenes")
         if (widest := self.widest_blur) > MOST_BLUR:
             raise SettingsError(
                 f"a blur of {self.blur[1]:g} image pixels at a zoom of {self.zoom[0]:g} is one of "
                 f"{widest:.1f} texture pixels, but at most {MOST_BLUR:g}: ask for less --blur or a "
                 "greater --zoom"
             )
-        if self.shake_pixels != SceneSettings.shake_pixels and not self.shake:
-            raise SettingsError(
-                "--shake-pixels says more of --shake, which is not asked for: pass that, too"
-            )
+        check_refined(self, {"shake_pixels": "shake"})
         if self.objects < 0:
             raise SettingsError(f"objects is {self.objects}, but must be 0 or more")
         if not self.objects:

@@ -1,7 +1,8 @@
-"""Intensity video -> events, or event tensors directly on the device: ESIM's sensor, with faults.
+"""Intensity video -> events: ESIM's sensor, with faults.
 
 One model with two equivalent outputs: `event_list` yields time-sorted `Events` on the host,
-`simulate` gives event tensors on the device. Both call `step` for each rendering of the scene:
+`sequences.simulate` gives event tensors on the device. Both call `step` for each rendering of the
+scene:
 
     L = log(0.001 + I);  a pixel emits an event, p = +1 or -1, each time L, taken as linear between
     two renderings, crosses reference + p C_p; the reference moves by p C_p, also when the
@@ -37,9 +38,9 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from firenet_jax.errors import SettingsError
-from firenet_jax.events import BINS, Events, concatenate
-from firenet_jax.settings import check_range, check_share, check_sizes
-from firenet_jax.simulation.scenes import Scene, flow, log_uniform, render, speeds
+from firenet_jax.events import Events, concatenate
+from firenet_jax.settings import check_range, check_refined, check_share, check_sizes
+from firenet_jax.simulation.scenes import log_uniform
 
 EPS = 0.001
 THRESHOLD, SPREAD, REFRACTORY = 0.18, 0.03, 1e-3  # defaults, as in the paper
@@ -47,7 +48,6 @@ LEAST_THRESHOLD = 0.01  # as in ESIM
 MOST_NOISE = 10_000  # events per second of a pixel: of more, each takes a rendering
 NOISE_IN_LIGHT = 0.25  # times the noise in the dark
 TICKS = 1024  # per microsecond
-EVENTS_PER_PASS = 4  # of a pixel, in one pass over the picture: saves memory traffic
 MAX_INTERVAL = 2**31 // TICKS - 1  # microseconds between two renderings
 # Lamps on mains of 50 and 60 hertz flicker at 100 and 120, screens from 60 on.
 FLICKER_HERTZ = (60.0, 240.0)
@@ -128,7 +128,7 @@ class SensorSettings:
             raise SettingsError(f"flicker is {self.flicker}, but light is not negative: at most 1")
         check_share("clean", self.clean, "sequences")
         if _on(self.hot) and self.hot[1] > 1:
-            raise SettingsError(f"hot is {self.hot}, but is a part of the pixels: at most 1")
+            raise SettingsError(f"hot is {self.hot}, but is a share of the pixels: at most 1")
         check_sizes(self, "threshold")
         lowest = min(x for x in (self.threshold, *(self.threshold_range or ()), 1) if x is not None)
         if lowest < LEAST_THRESHOLD:
@@ -175,18 +175,9 @@ def with_faults(sensor: SensorSettings) -> SensorSettings:
 
 
 def check_idle(sensor: SensorSettings) -> None:
-    """Raises SettingsError for what says more of a fault that is off, and so has no effect."""
-    for name, needed in (
-        ("asymmetry", "threshold_range"),
-        ("noise_in_light", "noise"),
-        ("cutoff_dark", "cutoff"),
-    ):
-        said = getattr(sensor, name) != getattr(SensorSettings, name)
-        if said and not _on(getattr(sensor, needed)):
-            more, option = name.replace("_", "-"), needed.replace("_", "-")
-            raise SettingsError(
-                f"--{more} says more of --{option}, which is not asked for: pass that, too"
-            )
+    """Raises SettingsError for what refines a fault that is off, and so has no effect."""
+    needs = {"asymmetry": "threshold_range", "noise_in_light": "noise", "cutoff_dark": "cutoff"}
+    check_refined(sensor, needs, _on)
 
 
 class Lamp(NamedTuple):
@@ -423,10 +414,10 @@ def step(
 
 
 def _low_pass(cutoff, seen: jax.Array, log: jax.Array, lit: jax.Array, seconds) -> jax.Array:
-    """By how much what comes of L by a low-pass of first order rises.
+    """The rise of a first-order low-pass of L over the interval.
 
-    Exactly that of an L which is linear between two renderings, so that it does not matter how many
-    there are; only that a pixel is as fast as at the end, the brighter the faster.
+    Exact for an L that is linear between two renderings, so that their number does not matter; only
+    the cutoff, which grows with brightness, is taken at the interval's end.
     """
     hertz, dark = cutoff
     a = seconds * 2 * jnp.pi * hertz * (dark + (1 - dark) * lit)
@@ -475,12 +466,12 @@ def _shot_noise(bits: jax.Array, expected: jax.Array, polarity: jax.Array, ticks
     return Run(first, jnp.zeros_like(first), fires.astype(jnp.int32), polarity)
 
 
-def _most_noise(noise: jax.Array, slope: jax.Array | None) -> jax.Array:
+def most_noise(noise: jax.Array, slope: jax.Array | None) -> jax.Array:
     """Events per second where there are most, in the dark or in full light."""
     return noise[0] if slope is None else noise[0] * jnp.exp(jnp.maximum(slope, 0.0))
 
 
-def _stamps(first, spacing, number):
+def stamps(first, spacing, number):
     """Microseconds after the interval's start of a run's number-th event; numpy or JAX, int32."""
     return (first + number * spacing + TICKS // 2) // TICKS
 
@@ -525,7 +516,7 @@ def _dense(
     intensity is linear from one of those that are given to the next."""
     rate, last = 0.0, None
     if sensor.noise is not None:
-        rate = 2e-6 * float(_most_noise(sensor.noise, sensor.noise_slope))  # per microsecond
+        rate = 2e-6 * float(most_noise(sensor.noise, sensor.noise_slope))  # per microsecond
     for time, image in renderings:
         time, image = int(time), jnp.asarray(image, jnp.float32)
         if rate and last is not None:
@@ -555,182 +546,8 @@ def _events(runs: tuple[Run, ...], start: int) -> Events:
         first, spacing, count = run.first[y, x], run.spacing[y, x], run.count[y, x]
         row = np.repeat(np.arange(len(count)), count)
         number = (np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)).astype(np.int32)
-        t = _stamps(first[row], spacing[row], number)
+        t = stamps(first[row], spacing[row], number)
         on = run.polarity[y, x][row] > 0
         chunks.append(Events.of(start + t.astype(np.int64), x[row], y[row], on))
     events = concatenate(chunks)
     return events.select(np.argsort(events.t, kind="stable"))
-
-
-# ---- Event tensors
-
-
-class Simulation(NamedTuple):
-    """T windows of B sequences. Images and displacement belong to the windows' ends."""
-
-    tensors: jax.Array
-    """(T, B, H, W, 5) float32, not normalised, window bounds as t_min and t_max."""
-    images: jax.Array
-    """(T, B, H, W) float32 in [0, 1], the truth at the window's end."""
-    displacement: jax.Array
-    """(T, B, H, W, 2) float32 pixels, from the window's start to its end."""
-    visible: jax.Array
-    """(T, B, H, W) bool, where the displacement leads to a visible place."""
-
-
-def _draw(scenes: Scene, seconds: jax.Array, *, height: int, width: int) -> jax.Array:
-    """B scenes, (B,) -> (B, H, W)."""
-    draw = partial(render, height=height, width=width)
-    return jax.vmap(draw)(scenes, seconds).image
-
-
-def first_states(
-    sensors: Sensor, scenes: Scene, times: jax.Array, *, height: int, width: int
-) -> SensorState:
-    """The states of B sensors that see B scenes for the first time at (B,) int32 microseconds."""
-    return jax.vmap(first_state)(sensors, _draw(scenes, 1e-6 * times, height=height, width=width))
-
-
-@partial(jax.jit, static_argnames=("height", "width", "renderings"))
-def simulate(
-    sensors: Sensor,
-    scenes: Scene,
-    bounds: jax.Array,
-    state: SensorState | None = None,
-    *,
-    height: int,
-    width: int,
-    renderings: int | tuple[int, int] = 5,
-) -> tuple[SensorState, Simulation]:
-    """B sensors before B scenes -> event tensors and truth, all on the device.
-
-    bounds: (T + 1, B) int32, microseconds since the scenes' start; window t lasts from t to t + 1.
-    state: what the last call returned, to go on where it ended; None starts afresh.
-    renderings: number in each window, equally spaced. Nothing moves by more than a pixel between
-    two if windows last at most renderings / scene.speed seconds. Or the fewest and the most: on a
-    CPU only as many as a window needs (`renderings_needed`); elsewhere the most, because sequences
-    are simulated side by side, and one of them needs it.
-    """
-    if state is None:
-        state = first_states(sensors, scenes, bounds[0], height=height, width=width)
-    least, most = (renderings, renderings) if isinstance(renderings, int) else renderings
-    one = partial(_one_sequence, size=(height, width), least=least)
-    side_by_side = jax.vmap(partial(one, counts=most), out_axes=(0, 1))
-    needed = partial(renderings_needed, height=height, width=width, least=least, most=most)
-
-    def one_by_one(*given):
-        counts = jax.vmap(needed)(*given[:3])
-        state, made = jax.lax.map(lambda each: one(*each), (*given, counts))
-        return state, jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), made)
-
-    given = sensors, scenes, bounds.T, state
-    if least == most:
-        return side_by_side(*given)
-    return jax.lax.platform_dependent(*given, cpu=one_by_one, default=side_by_side)
-
-
-def renderings_needed(
-    sensor: Sensor, scene: Scene, bounds: jax.Array, *, height: int, width: int, least, most
-) -> jax.Array:
-    """(T + 1,) int32 microseconds -> (T,) int32, how many renderings each window needs.
-
-    As many that nothing moves by more than half a pixel between two, and that there is at most one
-    event of noise in two of them; `most` where light flickers.
-    """
-    duration = 1e-6 * jnp.diff(bounds)
-    times = 1e-6 * bounds[:-1, None] + duration[:, None] * jnp.array([[0.0, 0.5, 1.0]])
-    seen = speeds(scene, times.ravel(), height=height, width=width).reshape(times.shape)
-    needed = duration * 1.1 * seen.max(-1) / 0.5  # 10 % for what is faster between these times
-    if sensor.noise is not None:
-        needed = jnp.maximum(needed, 2 * duration * _most_noise(sensor.noise, sensor.noise_slope))
-    if sensor.lamp is not None:
-        needed = jnp.where(sensor.lamp.swing.max() > 0, most, needed)
-    return jnp.clip(jnp.ceil(needed), least, most).astype(jnp.int32)
-
-
-def _one_sequence(sensor, scene, bounds, state, counts, *, size: tuple[int, int], least: int):
-    """`simulate` without its axis of the batch; size: height and width.
-
-    counts: (T,) int32 or a number, renderings in each window, `least` or more.
-    """
-    # Bins that votes of one rendering reach.
-    span = min(-(-(BINS - 1) // least) + 2, BINS)
-    height, width = size
-
-    def window(state, inputs):
-        start, end, number = inputs
-        count = counts if isinstance(counts, int) else counts[number]
-
-        def rendering(k, carry):
-            state, planes, passed, _ = carry
-            until = (k + 1) * (end - start) // count
-            image = render(scene, 1e-6 * (start + until), height=height, width=width).image
-            state, runs = step(sensor, state, image, until - passed)
-            low = jnp.minimum((BINS - 1) * k // count, BINS - span)
-            votes = jax.lax.dynamic_slice_in_dim(planes, low, span)
-            votes = _votes(votes, low, runs, passed, end - start)
-            planes = jax.lax.dynamic_update_slice_in_dim(planes, votes, low, 0)
-            return state, planes, until, image
-
-        planes, image = jnp.zeros((BINS, height, width)), jnp.zeros((height, width))
-        carry = state, planes, jnp.zeros_like(start), image
-        state, planes, _, image = jax.lax.fori_loop(0, count, rendering, carry)
-        displacement, visible = flow(scene, 1e-6 * start, 1e-6 * end, height=height, width=width)
-        return state, Simulation(planes.transpose(1, 2, 0), image, displacement, visible)
-
-    return jax.lax.scan(window, state, (bounds[:-1], bounds[1:], jnp.arange(len(bounds) - 1)))
-
-
-def to_and_fro(
-    data: Simulation, scenes: Scene, bounds: jax.Array, *, height: int, width: int
-) -> Simulation:
-    """T windows, an even number -> T windows: the first half forward and then backward.
-
-    Backward, time is reversed and polarity inverted: bins in reverse order, votes negated. Truth
-    and displacement are those of the scene.
-    bounds: (T + 1, B) int32, as in `simulate`.
-    """
-    half = len(data.images) // 2
-    draw = partial(_draw, height=height, width=width)
-    move = jax.vmap(partial(flow, height=height, width=width))
-    seconds = 1e-6 * bounds[half::-1]  # of the ends of windows, backward
-    displacement, visible = jax.lax.map(
-        lambda ends: move(scenes, *ends), (seconds[:-1], seconds[1:])
-    )
-    images = jnp.concatenate([data.images[: half - 1][::-1], draw(scenes, seconds[-1])[None]])
-    back = Simulation(-data.tensors[:half][::-1, ..., ::-1], images, displacement, visible)
-    return jax.tree.map(lambda forth, back: jnp.concatenate([forth[:half], back]), data, back)
-
-
-def _votes(planes: jax.Array, low, runs, passed: jax.Array, total: jax.Array) -> jax.Array:
-    """Adds the votes of runs (H, W) by Eq. 1 to planes (n, H, W), the bins from `low` on.
-
-    passed: () int32, microseconds from the window's start to the interval's; total: duration of
-    the window. Events of a pixel are processed one after the other, all pixels in parallel, up to
-    the count of the busiest one.
-    """
-    scale = (BINS - 1) / total.astype(jnp.float32)
-
-    def vote(planes, run, number):
-        stamp = passed + _stamps(run.first, run.spacing, number)
-        t_star = stamp.astype(jnp.float32) * scale
-        weight = jnp.where(number < run.count, run.polarity, 0.0)
-        return [
-            plane + weight * jnp.maximum(0.0, 1 - jnp.abs(low + n - t_star))
-            for n, plane in enumerate(planes)
-        ]
-
-    first = runs[0]
-    most = first.count.max()
-
-    def several(carry):
-        number, planes = carry
-        for n in range(EVENTS_PER_PASS):
-            planes = vote(planes, first, number + n)
-        return number + EVENTS_PER_PASS, planes
-
-    start = jnp.int32(0), list(planes)
-    _, voted = jax.lax.while_loop(lambda carry: carry[0] < most, several, start)
-    for run in runs[1:]:  # noise: at most one event
-        voted = vote(voted, run, 0)
-    return jnp.stack(voted)

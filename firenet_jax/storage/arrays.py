@@ -7,7 +7,6 @@
 It is written beside its final name and renamed when it is whole.
 """
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,15 @@ import h5py
 import numpy as np
 
 from firenet_jax.storage.disk import Disk
-from firenet_jax.storage.files import Noted, no_note, open_alone, partial_name, writing
+from firenet_jax.storage.files import (
+    Noted,
+    discard,
+    no_note,
+    open_alone,
+    partial_name,
+    publish,
+    writing,
+)
 
 
 class ArraysWriter:
@@ -57,15 +64,9 @@ class ArraysWriter:
             self.file.close()
             self.disk.check()
             noted(self.partial)
-            if os.name == "nt":  # an open file cannot be renamed there
-                self.held.close()
-            self.partial.replace(self.path)
-            self.held.close()
+            publish(self.held, self.partial, self.path)
 
     def abandon(self) -> None:
         """Removes the partial file."""
         self.file.close()
-        if os.name == "nt":
-            self.held.close()
-        self.partial.unlink(missing_ok=True)
-        self.held.close()
+        discard(self.held, self.partial)

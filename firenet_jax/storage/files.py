@@ -13,7 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from firenet_jax.errors import OutputError
+from firenet_jax.errors import OutputError, RecordingError
+
+LARGEST_TEXT = 1 << 28  # bytes of a list of times or of pixels
 
 
 def named(path: Path) -> Path:
@@ -162,6 +164,35 @@ def open_alone(beside: Path, path: Path) -> io.FileIO:
         opened.close()
         raise
     return opened
+
+
+def read_lines(path: Path, what: str) -> list[str]:
+    """The lines of a small text file. Raises RecordingError, which says that it is no `what`."""
+    check_readable(path, RecordingError)
+    check_no_pipe(path, RecordingError)
+    try:
+        if path.stat().st_size > LARGEST_TEXT:
+            raise RecordingError(f"{path}: is larger than {LARGEST_TEXT >> 20} MB: no {what}")
+        return path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is no text"
+        raise RecordingError(f"{path}: cannot read this {what}: {reason}") from error
+
+
+def publish(held: io.FileIO, beside: Path, path: Path) -> None:
+    """Gives the file beside an output, which is whole and locked, the output's name."""
+    if os.name == "nt":  # an open file cannot be renamed there, and has no lock
+        held.close()
+    beside.replace(path)
+    held.close()
+
+
+def discard(held: io.FileIO, beside: Path) -> None:
+    """Removes the file beside an output, which is not whole."""
+    if os.name == "nt":
+        held.close()
+    beside.unlink(missing_ok=True)
+    held.close()
 
 
 def remove_left(beside: Path) -> None:

@@ -1,7 +1,7 @@
 """Iterator -> the same iterator, run ahead in a thread: reading, device and writing overlap.
 
-Used as `for chunk in ahead(device(ahead(reader)))`. The work inside releases the GIL (text parser,
-HDF5, XLA, zlib), so the stages really run side by side.
+Used as `for chunk in prefetch(device(prefetch(reader)))`. The work inside releases the GIL (text
+parser, HDF5, XLA, zlib), so the stages really run side by side.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ def until_set(stop: threading.Event, items: Iterable[Item]) -> Iterator[Item]:
         yield item
 
 
-def ahead(items: Iterator, depth: int = 2, broken: threading.Event | None = None) -> Generator:
+def prefetch(items: Iterator, depth: int = 2, broken: threading.Event | None = None) -> Generator:
     """Yields what `items` yields, computed by a thread: `depth` items wait, and one is in hand.
 
     An exception of `items` is raised here, in its place among the items. Closing this iterator

@@ -15,7 +15,6 @@ x - d(x) before.
 """
 
 import json
-import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -25,7 +24,7 @@ import numpy as np
 
 from firenet_jax.events import Events, concatenate
 from firenet_jax.storage.disk import Disk
-from firenet_jax.storage.files import open_alone, partial_name, writing
+from firenet_jax.storage.files import discard, open_alone, partial_name, publish, writing
 
 ROWS = 1 << 16  # events in a chunk of the file, and so many are written at once
 GZIP = 4  # for 50 % more time than level 1: events take 10 % less room, flow 25 %
@@ -73,11 +72,9 @@ def write_sequence(
                         **facts,
                     )
                 disk.check()
-                if os.name == "nt":  # an open file cannot be renamed there, and has no lock
-                    opened.close()
-                beside.replace(path)
+                publish(opened, beside, path)
             except BaseException:
-                beside.unlink(missing_ok=True)
+                discard(opened, beside)
                 raise
     finally:
         for stream in (events, pictures):

@@ -22,7 +22,16 @@ from PIL import Image
 
 from firenet_jax.errors import OutputError, RecordingError, logger
 from firenet_jax.storage import bag
-from firenet_jax.storage.files import Noted, locked, no_note, open_alone, partial_name, writing
+from firenet_jax.storage.files import (
+    Noted,
+    discard,
+    locked,
+    no_note,
+    open_alone,
+    partial_name,
+    publish,
+    writing,
+)
 from firenet_jax.storage.runs import make_folder
 
 VIDEOS = (".mp4", ".gif")
@@ -382,19 +391,13 @@ class VideoWriter:
                 self.container.mux(packet)
             self.container.close()
             noted(self.partial)
-            if os.name == "nt":  # an open file cannot be renamed there, and has no lock
-                self.held.close()
-            self.partial.replace(self.path)
-            self.held.close()
+            publish(self.held, self.partial, self.path)
 
     def abandon(self) -> None:
         """Removes the partial file: a video cannot be continued."""
         with contextlib.suppress(OSError, FFmpegError):
             self.container.close()
-        if os.name == "nt":
-            self.held.close()
-        self.partial.unlink(missing_ok=True)
-        self.held.close()
+        discard(self.held, self.partial)
 
 
 def _palette_filter(height: int, width: int, tick: Fraction) -> Graph:

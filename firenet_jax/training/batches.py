@@ -1,4 +1,4 @@
-"""A folder of HDF5 sequences -> batches for training, of the same type as `sensor.simulate`.
+"""A folder of HDF5 sequences -> batches for training, of the same type as `sequences.simulate`.
 
 The files have the layout of event_cnn_minimal (see `storage.sequence_file`), which the data sets of
 event_cnn_minimal and ssl_e2vid use, and which `firenet simulate` writes. Window t of a batch
@@ -26,12 +26,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from firenet_jax.errors import RecordingError, SettingsError, logger
+from firenet_jax.errors import RecordingError, logger
 from firenet_jax.events import BINS, Events, checked, concatenate, counted, event_number
 from firenet_jax.readers import frame_times, in_chunks, to_events, to_frame
 from firenet_jax.readers.hdf5 import check_stored, in_order, opened
-from firenet_jax.settings import check_sizes
-from firenet_jax.simulation.sensor import Simulation
+from firenet_jax.settings import check_share, check_sizes
+from firenet_jax.simulation.sequences import Simulation
 from firenet_jax.storage.files import files_in
 from firenet_jax.tensors import Packed, pack, voxelise
 from firenet_jax.warp import warp
@@ -61,8 +61,8 @@ class Augment:
 
     def __post_init__(self):
         for name in ("flip", "pauses", "stay", "hot_pixels"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise SettingsError(f"{name} is {getattr(self, name)}, but must be between 0 and 1")
+            of = "pixels" if name == "hot_pixels" else "windows"
+            check_share(name, getattr(self, name), of)
         check_sizes(self, "voxel_noise", zero=True)
 
 

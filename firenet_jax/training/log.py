@@ -23,7 +23,7 @@ from firenet_jax.checkpoint import save_weights
 from firenet_jax.devices import is_first
 from firenet_jax.errors import logger
 from firenet_jax.network import Weights
-from firenet_jax.pictures import event_pictures
+from firenet_jax.pictures import event_pictures, to_8_bit
 from firenet_jax.storage.files import write_text, writing
 
 # tensorboardX imports PyTorch where it is installed, for tensors that it is not given here: that
@@ -82,8 +82,8 @@ class Log:
             return
         images, truths, tensors = pictures
         chosen = [len(images) * k // 3 - 1 for k in (1, 2, 3)]
-        grey = np.asarray(jnp.concatenate([images, truths], -1)[np.array(chosen)])
-        grey = np.round(255 * np.clip(grey, 0, 1)).astype(np.uint8)[..., None]
+        grey = jnp.concatenate([images, truths], -1)[np.array(chosen)]
+        grey = np.asarray(to_8_bit(grey))[..., None]
         events = np.asarray(event_pictures(tensors[np.array(chosen)]))
         sheet = np.concatenate([events, np.repeat(grey, 3, -1)], 2)  # (3, H, 3 W, 3)
         sheet = sheet.reshape(-1, *sheet.shape[2:])

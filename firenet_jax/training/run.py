@@ -33,7 +33,7 @@ from firenet_jax.checkpoint import load_weights
 from firenet_jax.devices import TIME_BATCH, is_first, join, replicated, sharding
 from firenet_jax.errors import CheckpointError, FirenetError, OutputError, SettingsError, logger
 from firenet_jax.network import Weights, initial_params
-from firenet_jax.simulation.sensor import Simulation
+from firenet_jax.simulation.sequences import Simulation
 from firenet_jax.simulation.textures import load_textures, pictures_in
 from firenet_jax.storage import runs
 from firenet_jax.storage.files import locked, write_text
@@ -68,7 +68,7 @@ def run(
     join(settings.coordinator, settings.processes, settings.process)
     if settings.batch % jax.device_count():
         raise SettingsError(
-            f"batch is {settings.batch}, but the sequences of a batch are dealt out to "
+            f"batch is {settings.batch}, but the sequences of a batch are shared by "
             f"{jax.device_count()} devices: choose a multiple of that"
         )
     folder = settings.output
@@ -239,9 +239,9 @@ def sources_of(settings: Train, done: int) -> tuple[Iterator, list[Callable[[], 
             files, **shape, chain=chain, augment=augment, seed=settings.seed, first=done
         )
         fixed = batches(others, **shape, augment=NO_AUGMENT, seed=settings.seed)
-        validation = [_dealt(next(fixed)) for _ in range(VALIDATION)]
+        validation = [_sharded(next(fixed)) for _ in range(VALIDATION)]
         fixed.close()
-        return map(_dealt, training), [partial(lambda data: data, data) for data in validation]
+        return map(_sharded, training), [partial(lambda data: data, data) for data in validation]
 
     def load(count, seed):
         pictures = load_textures(settings.images, count, TEXTURE, seed, settings.procedural)
@@ -254,16 +254,16 @@ def sources_of(settings: Train, done: int) -> tuple[Iterator, list[Callable[[], 
     ]
 
 
-def _dealt(data: Simulation) -> Simulation:
+def _sharded(data: Simulation) -> Simulation:
     """A batch, sharded over the devices; every process has read all of it."""
     if jax.device_count() == 1:
         return data
 
-    def dealt(whole):
+    def share_of(whole):
         whole = np.asarray(whole)
         return jax.make_array_from_callback(whole.shape, sharding(TIME_BATCH), whole.__getitem__)
 
-    return jax.tree.map(dealt, data)
+    return jax.tree.map(share_of, data)
 
 
 def _check_finite(terms: dict[str, float], state: TrainState, folder: Path) -> None:

@@ -13,6 +13,7 @@ import tyro
 
 from firenet_jax.devices import check_processes
 from firenet_jax.errors import SettingsError
+from firenet_jax.evaluation import metrics
 from firenet_jax.settings import check_none_idle, check_range, check_seed, check_share, check_sizes
 from firenet_jax.simulation.curricula import LONGEST_WINDOW, check_motion, check_rare
 from firenet_jax.simulation.scenes import SceneSettings
@@ -29,8 +30,6 @@ SIMULATED = (  # settings of sequences that are simulated
     "images", "textures", "procedural", "renderings", "motion", "slow", "swift", "to_and_fro",
     "scene", "sensor",
 )  # fmt: skip
-MIN_CROP = 11  # pixels on a side of what validation measures: SSIM's window
-MIN_CROP_CW_SSIM = 17  # what the filters of CW-SSIM need
 
 
 @dataclass(frozen=True)
@@ -71,8 +70,8 @@ class Train:
     """Truncated back-propagation through time: carry the state through up to this many steps.
     Simulated sequences of a batch differ in length (64, batch 4: 3, 8, 23, 64)."""
     renderings: int = 5
-    """Greatest number of renderings per window; on a CPU there are fewer where less moves. A pixel
-    has at most one event of noise between two, so of more --noise than that, there is less."""
+    """Greatest number of renderings per window; on a CPU, slow windows get fewer. A pixel has at
+    most one noise event between two renderings, so stronger --noise is cut off there."""
     motion: tuple[float, float] = (1.25, 2.5)
     """Pixels by which the fastest point moves in a window, at most one per rendering; drawn
     log-uniformly for each sequence."""
@@ -136,9 +135,10 @@ class Train:
             )
         if not any(getattr(self.loss, name) for name in DISTANCES):
             raise SettingsError(f"no distance has a weight: pass one of {', '.join(DISTANCES)}")
-        if self.crop < MIN_CROP:
+        if self.crop < metrics.WINDOW:
             raise SettingsError(
-                f"crop is {self.crop} pixels, but images smaller than {MIN_CROP} cannot be judged"
+                f"crop is {self.crop} pixels, but images smaller than {metrics.WINDOW} cannot be "
+                "judged"
             )
         _check_idle(self)
         if not self.data:
@@ -198,9 +198,9 @@ def _check_idle(settings: Train) -> None:
 def _check_step(settings: Train) -> None:
     """Raises SettingsError for what the first step would, when a folder already is of this run."""
     crop, chain, windows = settings.crop, settings.chain, settings.windows
-    if settings.loss.cw_ssim and crop < MIN_CROP_CW_SSIM:
+    if settings.loss.cw_ssim and crop < metrics.CW_SSIM_SIDE:
         raise SettingsError(
-            f"crop is {crop} pixels, but --cw-ssim needs {MIN_CROP_CW_SSIM} or more"
+            f"crop is {crop} pixels, but --cw-ssim needs {metrics.CW_SSIM_SIDE} or more"
         )
     if settings.data:
         return

@@ -27,14 +27,8 @@ from firenet_jax.evaluation import metrics
 from firenet_jax.network import State, initial_state, step
 from firenet_jax.simulation.curricula import random_setups, window_bounds
 from firenet_jax.simulation.scenes import SceneSettings
-from firenet_jax.simulation.sensor import (
-    SensorSettings,
-    SensorState,
-    Simulation,
-    first_states,
-    simulate,
-    to_and_fro,
-)
+from firenet_jax.simulation.sensor import SensorSettings, SensorState
+from firenet_jax.simulation.sequences import Simulation, first_states, simulate, to_and_fro
 from firenet_jax.tensors import normalise
 from firenet_jax.training.centring import centred, input_means
 from firenet_jax.training.losses import Loss, sequence_loss

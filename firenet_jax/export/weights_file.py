@@ -10,8 +10,9 @@ need besides of FireNet+'s, an object of their own class, cannot be written from
 """
 
 from firenet_jax.checkpoint import original_names
+from firenet_jax.events import BINS
 from firenet_jax.export import missing
-from firenet_jax.network import BINS, CHANNELS, Weights
+from firenet_jax.network import CHANNELS, Weights
 from firenet_jax.storage.pytorch_save import pytorch_file
 
 # As in the published checkpoint, which both programs build the network by.
