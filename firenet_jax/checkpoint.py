@@ -20,7 +20,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from firenet_jax.errors import CheckpointError
 from firenet_jax.events import BINS
 from firenet_jax.network import CHANNELS, Weights
-from firenet_jax.storage.files import check_readable
+from firenet_jax.storage.files import check_readable, check_unpacking
 from firenet_jax.storage.pytorch_file import identify, read_state_dict, refuse_unused, take
 
 FORMAT = 1
@@ -121,6 +121,7 @@ def _load_npz(path: Path) -> Weights:
         size = path.stat().st_size
         if size <= 2 * MAX_BYTES:  # with its directory, which is read whole
             with zipfile.ZipFile(path) as archive:
+                check_unpacking(path, archive, CheckpointError)
                 size = sum(info.file_size for info in archive.infolist())
         if size > MAX_BYTES:
             raise CheckpointError(f"{path} holds {size} bytes and is not a FireNet (157 kB); {TRY}")

@@ -8,6 +8,7 @@ from typing import Any, overload
 from firenet_jax.errors import SettingsError
 
 LONGEST_SIDE = 2**15  # pixels; coordinates are int16
+MOST_PIXELS = 2**24  # of a sensor: several times as many as any has
 
 
 @overload
@@ -24,6 +25,7 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
         raise SettingsError(f"sensor size {text[:60]!r}: expected WIDTHxHEIGHT, such as 240x180")
     if max(int(width), int(height)) > LONGEST_SIDE:
         raise SettingsError(f"sensor size {text}: a side is at most {LONGEST_SIDE} pixels")
+    _check_pixels(text, int(height) * int(width))
     return int(height), int(width)
 
 
@@ -38,7 +40,13 @@ def sides(size: tuple[int, int] | str | None) -> tuple[int, int] | None:
         height = width = whole = 0
     if not (whole and 0 < min(height, width) and max(height, width) <= LONGEST_SIDE):
         raise SettingsError(f'sensor size {size}: expected (height, width), or "WIDTHxHEIGHT"')
+    _check_pixels(size, height * width)
     return height, width
+
+
+def _check_pixels(size: Any, pixels: int) -> None:
+    if pixels > MOST_PIXELS:
+        raise SettingsError(f"sensor size {size}: a sensor has at most {MOST_PIXELS:,} pixels")
 
 
 def check_seed(seed: int) -> None:

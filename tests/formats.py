@@ -98,13 +98,16 @@ def _with_field(identifier: bytes, fields) -> tuple[bytearray, int]:
     return bytearray(struct.pack("<I", start) + identifier + table), start + last
 
 
-def aedat4(streams: dict[int, tuple[str, int, int]], packets) -> bytes:
-    """streams: number: (kind, width, height); packets: (stream, bytes); nothing is compressed"""
+def aedat4(streams: dict[int, tuple], packets) -> bytes:
+    """streams: number: (kind, width, height), and perhaps a camera; packets: (stream, bytes);
+    nothing is compressed"""
     nodes = "".join(
         f'<node name="{number}" path="/mainloop/output/{number}/"><attr key="typeIdentifier" '
         f'type="string">{kind}</attr><node name="info"><attr key="sizeX" type="int">{width}</attr>'
-        f'<attr key="sizeY" type="int">{height}</attr></node></node>'
-        for number, (kind, width, height) in streams.items()
+        f'<attr key="sizeY" type="int">{height}</attr>'
+        + "".join(f'<attr key="source" type="string">{camera}</attr>' for camera in cameras)
+        + "</node></node>"
+        for number, (kind, width, height, *cameras) in streams.items()
     )
     text = f'<dv version="2.0"><node name="outInfo" path="/">{nodes}</node></dv>'.encode()
     header, place = _with_field(b"IOHE", [("i", 0), ("q", -1), ("i", 0)])

@@ -355,6 +355,34 @@ def test_triggers_of_aedat4(tmp_path, name):
     assert open_recording(path).triggers() is None
 
 
+def test_of_several_cameras_in_an_aedat4_all_streams_are_of_the_first(tmp_path, caplog):
+    ours, other = "DVXplorer_7", "DAVIS346_9"
+    streams = {
+        0: ("TRIG", 0, 0, other),
+        1: ("EVTS", 640, 480, ours),
+        2: ("EVTS", 346, 260, other),
+        3: ("TRIG", 0, 0, ours),
+    }
+    rows = [(t, *event) for t, event in zip(T.tolist(), EVENTS, strict=True)]
+    packets = [
+        (0, formats.triggers4([(10, 1)])),
+        (2, formats.events4([(5, 1, 1, 1)])),
+        (1, formats.events4(rows)),
+        (3, formats.triggers4([(30, 1)])),
+    ]
+    path = write(tmp_path / "a.aedat4", formats.aedat4(streams, packets))
+    check(path, T, X, Y, P, size=None)
+    recording = open_recording(path)
+    assert (recording.height, recording.width, recording.grey) == (480, 640, True)
+    assert edges(recording) == [(30, 0, True)]
+    assert f"streams of {other}, too; reading those of {ours}" in caplog.text
+    del streams[3]
+    assert open_recording(write(path, formats.aedat4(streams, packets[:3]))).triggers() is None
+    streams = {number: stream[:3] for number, stream in streams.items()}  # no cameras named
+    path = write(tmp_path / "b.aedat4", formats.aedat4(streams, packets[:3]))
+    assert edges(open_recording(path)) == [(10, 0, True)]
+
+
 # ---------------------------------------------------------------- real recordings
 
 

@@ -364,6 +364,14 @@ def test_what_stands_beside_the_network_is_left_out(converted):
     assert converted(tensors).normalise
 
 
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_weights_that_python_would_unpack_whole_are_refused(tmp_path, method):
+    with zipfile.ZipFile(tmp_path / "w.npz", "w", method) as archive:
+        archive.writestr("format.npy", b"0" * 100)
+    with pytest.raises(CheckpointError, match="compressed by another method than deflate"):
+        load_weights(tmp_path / "w.npz")
+
+
 @pytest.mark.reference
 @pytest.mark.parametrize("new", [False, True], ids=["old", "new"])
 @pytest.mark.parametrize("family", FAMILIES)

@@ -31,7 +31,7 @@ from firenet_jax.live.engine import (
     Limits,
     Waiting,
     pictures,
-    sound,
+    valid_events,
     windows,
     without_hot_pixels,
 )
@@ -179,7 +179,7 @@ def test_any_bytes_decode_to_something(wire):
     noise = np.random.default_rng(0).bytes(13 * 800)
     figures = Figures()
     for events in sources.decoded([noise], wire):
-        inside = list(sound([events.select(slice(900))], 2**15, 2**15, figures))
+        inside = list(valid_events([events.select(slice(900))], 2**15, 2**15, figures))
         assert all((e.t >= 0).all() for e in inside)
 
 
@@ -386,10 +386,10 @@ def test_the_last_events_before_a_pause_do_not_wait_for_its_end():
 def test_what_cannot_be_is_left_out_and_counted():
     events = Events.of([5, 6, 4, 7, 8], [0, 20, 1, 2, -1], [0, 0, 0, 12, 3], [1] * 5)
     figures = Figures()
-    (found,) = sound([events], HEIGHT, WIDTH, figures)
+    (found,) = valid_events([events], HEIGHT, WIDTH, figures)
     assert rows(found) == [(5, 0, 0, True)] and (figures.events, figures.bad) == (5, 4)
     with pytest.raises(RecordingError, match="--sensor-size and --wire"):
-        list(sound([some_events(2000)], 2, 2, Figures()))
+        list(valid_events([some_events(2000)], 2, 2, Figures()))
 
 
 def test_hot_pixels_are_found_as_events_come_and_left_out(tmp_path):
@@ -429,7 +429,7 @@ def test_a_sender_that_starts_again_is_seen_again(broken):
         before.t[-1] = broken
     after = [some_events(200, seed=k, last=9000, start=10_000 * k) for k in range(100)]
     figures = Figures()
-    found = concatenate(list(sound([before, *after], HEIGHT, WIDTH, figures)))
+    found = concatenate(list(valid_events([before, *after], HEIGHT, WIDTH, figures)))
     assert len(found) >= 5000 + 20_000 - 1200 and figures.bad <= 1200
     assert (np.diff(found.t) >= 0).all()
     assert rows(found)[-200:] == [(t, x, y, p) for t, x, y, p in rows(found)[-200:]]
@@ -442,7 +442,7 @@ def test_a_late_time_at_the_beginning_is_survived(piece):
     events.t[50] = 2**45
     figures = Figures()
     arrivals = [events.select(slice(k, k + piece)) for k in range(0, 20_000, piece)]
-    found = concatenate(list(sound(arrivals, HEIGHT, WIDTH, figures)))
+    found = concatenate(list(valid_events(arrivals, HEIGHT, WIDTH, figures)))
     assert len(found) == 20_000 - figures.bad >= 20_000 - 1000 - piece
     assert (np.diff(found.t) >= 0).all() and figures.outside == 0
 
@@ -451,7 +451,7 @@ def test_a_sender_that_starts_again_at_once_is_seen_again():
     later = [some_events(500, seed=k, start=10**6 * k, last=10**6) for k in range(9)]
     arrivals = [some_events(500, start=10**9), *later]
     figures = Figures()
-    found = concatenate(list(sound(arrivals, HEIGHT, WIDTH, figures)))
+    found = concatenate(list(valid_events(arrivals, HEIGHT, WIDTH, figures)))
     assert len(found) >= 5000 - 1000 and (np.diff(found.t) >= 0).all()
 
 
@@ -729,15 +729,15 @@ def test_wrong_times_now_and_then_do_not_stop_all():
         parts = chunks[n].select(slice(4)), wrong, chunks[n].select(slice(4, None))
         chunks[n] = concatenate(parts)
     figures = Figures()
-    found = concatenate([*sound(chunks, 12, 20, figures)])
+    found = concatenate([*valid_events(chunks, 12, 20, figures)])
     assert (figures.events, figures.bad, len(found)) == (6010, 10, 6000)
     assert (np.diff(found.t) >= 0).all() and found.t[-1] < 600_000
     first = concatenate([wrong, chunks[0]])  # nor does the very first
-    assert len(concatenate([*sound([first, *chunks[1:]], 12, 20, Figures())])) == 6000
+    assert len(concatenate([*valid_events([first, *chunks[1:]], 12, 20, Figures())])) == 6000
     # The last of a chunk cannot be told from a pause: a thousand events later it goes on from it.
     chunks[100] = concatenate([chunks[100], wrong])
     figures = Figures()
-    found = concatenate([*sound(chunks, 12, 20, figures)])
+    found = concatenate([*valid_events(chunks, 12, 20, figures)])
     assert figures.bad < 1100 and found.t[-1] > 2**50
 
 

@@ -345,6 +345,17 @@ def test_a_sensor_that_cannot_be_is_refused(tmp_path, size):
     refused(write(tmp_path / "a.txt", f"{size}\n0.1 3 2 1\n"), said, size=None)
 
 
+def test_a_sensor_with_more_pixels_than_any_is_refused(tmp_path):
+    said = "a sensor of 6000x6000 pixels, expected at most 16,777,216"
+    refused(write(tmp_path / "a.txt", "6000 6000\n0.1 3 2 1\n"), f"states {said}", size=None)
+    path = write(tmp_path / "b.txt", "0.1 5999 5999 1\n")
+    refused(path, f"has events that lie on {said}", size=None)
+    with pytest.raises(SettingsError, match="a sensor has at most 16,777,216 pixels"):
+        open_recording(path, "6000x6000")
+    with pytest.raises(SettingsError, match="a sensor has at most 16,777,216 pixels"):
+        open_recording(path, (6000, 6000))
+
+
 def test_whole_seconds_are_said_as_they_may_be_microseconds(tmp_path, caplog):
     for name, step, said in (("us", 1.0, True), ("seconds", 0.125, False)):
         lines = "\n".join(f"{step * k!r} 1 2 1" for k in range(1000))
@@ -352,6 +363,31 @@ def test_whole_seconds_are_said_as_they_may_be_microseconds(tmp_path, caplog):
         t = events_of(write(tmp_path / f"{name}.txt", lines), (240, 320)).t
         assert t.tolist() == [round(1e6 * step * k) for k in range(1000)]
         assert ("t_us x y p" in caplog.text) == said
+
+
+@pytest.mark.parametrize("kind", ["f8", "f4"])
+@pytest.mark.parametrize("form", ["h5", "folder", "npy"])
+def test_times_that_may_be_wrong_are_said(tmp_path, caplog, form, kind):
+    t = (1000 + 61e-6 * np.arange(2000)).astype(kind)
+    whole = np.arange(2000).astype(kind)
+    for times, said in ((t, "tells these times apart by 61 us"), (whole, "though whole ones")):
+        caplog.clear()
+        ones = np.ones(len(times), np.int16)
+        path = tmp_path / f"{len(list(tmp_path.iterdir()))}"
+        if form == "h5":
+            with h5py.File(path, "w") as file:
+                for name, column in {"ts": times, "xs": ones, "ys": ones, "ps": ones}.items():
+                    file[f"events/{name}"] = column
+        elif form == "folder":
+            path.mkdir()
+            np.save(path / "events_ts.npy", times)
+            np.save(path / "events_xy.npy", np.stack([ones, ones], -1))
+            np.save(path / "events_p.npy", ones)
+        else:
+            path = path.with_suffix(".npy")
+            np.save(path, np.stack([times, ones, ones, ones], -1).astype(kind))
+        open_recording(path, (240, 320))
+        assert (said in caplog.text) == (kind == "f4" or times is whole)
 
 
 @pytest.mark.parametrize(
@@ -403,6 +439,15 @@ def test_compressed_text(tmp_path):
     with gzip.open(tmp_path / "a.txt.gz", "wb") as file:
         file.write(TEXTS["size"].encode())
     check(tmp_path / "a.txt.gz", size=None)
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_compressions_that_python_unpacks_whole_are_refused(tmp_path, method):
+    """A kilobyte of them may hold gigabytes, whatever size the archive states."""
+    for name, member in (("a.zip", "events.txt"), ("a.npz", "t.npy")):
+        with zipfile.ZipFile(tmp_path / name, "w", method) as archive:
+            archive.writestr(member, TEXTS["size"])
+        refused(tmp_path / name, f"'{member}' is compressed by another method than deflate")
 
 
 def test_damaged_compressed_text(tmp_path):
@@ -667,6 +712,16 @@ def test_hdf5_event_cnn_minimal(tmp_path):
     refused(path, "timestamps of shape (2,), not one")
 
 
+def test_a_picture_of_hdf5_that_claims_to_be_enormous_is_not_unpacked(tmp_path):
+    path = write_cnn(tmp_path / "a.h5")
+    with h5py.File(path, "a") as file:
+        del file["images/image000000001"]
+        picture = file.create_dataset("images/image000000001", (40_000, 30_000), "u1", chunks=True)
+        picture.attrs["timestamp"] = 0.1  # a few bytes on disk
+    with pytest.raises(RecordingError, match=r"claims a picture of shape \(40000, 30000\)"):
+        open_recording(path).frames.read(1)
+
+
 def test_hdf5_dsec(tmp_path):
     hdf5plugin = pytest.importorskip("hdf5plugin")
     with h5py.File(tmp_path / "events.h5", "w") as file:
@@ -679,6 +734,11 @@ def test_hdf5_dsec(tmp_path):
         del file["t_offset"]
         file["t_offset"] = [7_000_000]
     check(tmp_path / "events.h5", t=T + 7_000_000)
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        for name, column in zip("txyp", (T, X, Y, P), strict=True):
+            file[f"events/{name}"] = column
+        file.create_dataset("t_offset", (10**9,), "i8", chunks=(1000,))  # a few bytes on disk
+    refused(tmp_path / "b.h5", "t_offset has the shape (1000000000,), expected one number")
     assert open_recording(tmp_path / "events.h5", (240, 320)).count == 5
 
 
@@ -1423,6 +1483,23 @@ def test_colour_frames_of_bags(new_bag, caplog):
     bag.close()
     assert open_recording(path).frames is None
     assert "bayer_rggb8: no frames" in caplog.text
+
+
+def test_frames_of_bags_with_several_topics_of_images(new_bag, caplog):
+    path, bag = new_bag("a")  # as ESIM names them
+    bag.events("/cam0/events", EPOCH, T + EPOCH, X, Y, P)
+    bag.image("/cam0/depthmap", EPOCH, np.zeros((3, 16), np.uint8), "32FC1")
+    bag.image("/cam0/image_raw", EPOCH, FRAME)
+    bag.image("/cam1/image_raw", EPOCH, FRAME[::-1])
+    bag.close()
+    np.testing.assert_array_equal(open_recording(path).frames.read(0), FRAME)
+    assert "another camera" not in caplog.text
+    path, bag = new_bag("b")
+    bag.events("/prophesee/events", EPOCH, T + EPOCH, X, Y, P)
+    bag.image("/realsense/image", EPOCH, FRAME)
+    bag.close()
+    np.testing.assert_array_equal(open_recording(path).frames.read(0), FRAME)
+    assert "frames are those of /realsense/image, which may be another camera" in caplog.text
 
 
 def test_wrong_bags(new_bag, tmp_path):

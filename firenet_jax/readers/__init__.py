@@ -35,7 +35,7 @@ from firenet_jax.events import (
     no_triggers,
     until_damage,
 )
-from firenet_jax.settings import LONGEST_SIDE, sides
+from firenet_jax.settings import LONGEST_SIDE, MOST_PIXELS, sides
 from firenet_jax.storage.files import check_no_pipe, check_readable, forbidden
 
 # In the order in which they are asked.
@@ -158,6 +158,7 @@ def _stated(path: Path, source: Source) -> tuple[int, int] | None:
             f"{path}: states a sensor of {width}x{height} pixels, expected sides of 1 to "
             f"{LONGEST_SIDE}: pass the right --sensor-size WIDTHxHEIGHT"
         )
+    _check_pixels(path, "states", height, width)
     return height, width
 
 
@@ -171,12 +172,22 @@ def _infer_size(path: Path, events: Iterator[Events]) -> tuple[int, int]:
         raise RecordingError(
             f"{path}: holds no events: check that it was recorded and copied whole"
         )
+    _check_pixels(path, "has events that lie on", height, width)
     logger.warning(
         "%s names no sensor size; %dx%d inferred from its events; "
         "--sensor-size WIDTHxHEIGHT sets another and saves this pass over the file",
         path, width, height,
     )  # fmt: skip
     return height, width
+
+
+def _check_pixels(path: Path, how: str, height: int, width: int) -> None:
+    """Raises RecordingError for more pixels than any sensor has: all of them would be counted."""
+    if height * width > MOST_PIXELS:
+        raise RecordingError(
+            f"{path}: {how} a sensor of {width}x{height} pixels, expected at most {MOST_PIXELS:,}: "
+            "pass the right --sensor-size WIDTHxHEIGHT"
+        )
 
 
 def in_chunks(

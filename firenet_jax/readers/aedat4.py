@@ -24,7 +24,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pyarrow as pa
 
-from firenet_jax.errors import RecordingError
+from firenet_jax.errors import RecordingError, logger
 from firenet_jax.events import MAX_TIME, Frames
 from firenet_jax.readers import Source, aedat, all_triggers, joined, reading, to_chunks, to_frame
 
@@ -141,25 +141,40 @@ def _layout(path: Path) -> Layout:
             raise RecordingError(f"{damaged} ({error}): {remedy}") from error
     if codec not in CODECS:
         raise RecordingError(f"{damaged} (compression {codec}): {remedy}")
-    first = {kind: number for number, (kind, _) in reversed(streams.items())}
-    if "EVTS" not in first:
-        kinds = ", ".join(sorted(first)) or "nothing"
+    events = next((stream for stream in streams if stream.kind == "EVTS"), None)
+    if events is None:
+        kinds = ", ".join(sorted({stream.kind for stream in streams})) or "nothing"
         raise RecordingError(f"{path}: holds no events, but {kinds}: record them too")
+    camera = events.camera
+    own = [stream for stream in streams if not camera or stream.camera in (camera, "")]
+    first = {stream.kind: stream.number for stream in reversed(own)}
+    if others := sorted({stream.camera for stream in streams if stream not in own}):
+        found = ", ".join(others)
+        logger.warning("%s: holds streams of %s, too; reading those of %s", path, found, camera)
     return Layout(
         CODECS[codec],
         begin,
         end if end >= begin else None,
-        first["EVTS"],
+        events.number,
         first.get("FRME"),
-        streams[first["EVTS"]][1],
-        b">DVXplorer_" in header,
+        events.size,
+        camera.startswith("DVXplorer_"),
         first.get("TRIG"),
     )
 
 
-def _streams(text: bytes) -> dict[int, tuple[str, tuple[int, int] | None]]:
-    """XML -> number of a stream: (kind, (height, width) where it states them)"""
-    found = {}
+class Stream(NamedTuple):
+    """What the header says of a stream."""
+
+    number: int
+    kind: str
+    size: tuple[int, int] | None  # (height, width); None: not stated
+    camera: str  # "DAVIS346_00000459"; "": not stated
+
+
+def _streams(text: bytes) -> list[Stream]:
+    """From the header's XML."""
+    found = []
     for node in ElementTree.fromstring(text.rstrip(b"\0").strip()).iter("node"):
         said = {attribute.get("key"): attribute.text for attribute in node.findall("attr")}
         if "typeIdentifier" not in said:
@@ -167,7 +182,8 @@ def _streams(text: bytes) -> dict[int, tuple[str, tuple[int, int] | None]]:
         inside = {attribute.get("key"): attribute.text for attribute in node.iter("attr")}
         height, width = inside.get("sizeY"), inside.get("sizeX")
         size = (int(height), int(width)) if height and width else None
-        found[int(node.get("name") or -1)] = said["typeIdentifier"], size
+        number, kind = int(node.get("name") or -1), said["typeIdentifier"] or ""
+        found.append(Stream(number, kind, size, inside.get("source") or ""))
     return found
 
 

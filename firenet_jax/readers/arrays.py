@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from firenet_jax.errors import RecordingError, logger
+from firenet_jax.errors import RecordingError
 from firenet_jax.events import MAX_TIME, Recording, checked
 from firenet_jax.readers import in_chunks
-from firenet_jax.readers.text import NAMES, warn_of_whole_seconds
+from firenet_jax.readers.text import NAMES, warn_of_coarse_times, warn_of_whole_seconds
 from firenet_jax.settings import LONGEST_SIDE
 
 UNITS = {"s": None, "ms": 1000, "us": 1}  # in microseconds; seconds become float64
@@ -83,13 +83,7 @@ def _in_unit(name: str, t: np.ndarray, unit: str | None) -> np.ndarray:
     """Whole microseconds or floating seconds, as `to_events` takes them."""
     if t.dtype.kind not in "iuf":
         raise RecordingError(f"{name}: t is {t.dtype}, expected numbers")
-    if t.dtype in (np.float16, np.float32):
-        apart = float(np.spacing(np.abs(t).max())) * {"ms": 1e3, "us": 1.0}.get(unit or "s", 1e6)
-        if apart > 1:
-            logger.warning(
-                "%s: t is %s, which tells these times apart by %.3g us: pass float64 or whole "
-                "microseconds, from before they were rounded", name, t.dtype, apart,
-            )  # fmt: skip
+    warn_of_coarse_times(Path(name), t, unit or "s")
     if unit is None:
         warn_of_whole_seconds(Path(name), t, 'pass unit="us"')
         return t

@@ -1,7 +1,8 @@
 """Event Stream .es -> Source, through faery: 5 bytes an event, rows counted from the bottom.
 
 faery turns the rows round. Times are microseconds; it clamps a time that falls below an earlier one
-to that one. A file that was cut off between two events looks whole: it does not say how long it is.
+to that one. A file that was cut off looks whole: it does not say how long it is, and faery leaves
+out a part of an event.
 """
 
 from collections.abc import Iterator

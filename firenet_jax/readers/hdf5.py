@@ -13,6 +13,7 @@ Times are microseconds where they are integers, seconds where they are floating.
 anew by every pass over the events and for every frame, and read in slices.
 """
 
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -24,7 +25,17 @@ import numpy as np
 
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Frames, Rows
-from firenet_jax.readers import Source, extra, frame_times, in_chunks, reading, size_of, to_frame
+from firenet_jax.readers import (
+    Source,
+    extra,
+    frame_times,
+    in_chunks,
+    reading,
+    size_of,
+    text,
+    to_frame,
+)
+from firenet_jax.settings import MOST_PIXELS
 from firenet_jax.storage.files import check_readable
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -32,6 +43,9 @@ COLUMNS = {"event_cnn_minimal": ("ts", "xs", "ys", "ps"), "DSEC": ("t", "x", "y"
 MVSEC = "davis/left"
 METAVISION = "CD/events"
 ECF = 36559  # number of Metavision's compression
+# Bytes of unpacked chunks that are kept of a data set: where all of a column is one chunk, it would
+# else be unpacked anew for each slice.
+CACHE = 1 << 26
 
 
 def matches(path: Path) -> bool:
@@ -46,7 +60,11 @@ def matches(path: Path) -> bool:
 def read(path: Path) -> Source:
     with opened(path) as file:
         layout = _layout(path, file)
-        _, count = _columns(path, file, layout)
+        rows, count = _columns(path, file, layout)
+        ends = slice(text.SNIFFED), slice(max(count - 1, 0), count)
+        t = np.concatenate([np.asarray(next(iter(rows(part)))) for part in ends])
+        text.warn_of_coarse_times(path, t)
+        text.warn_of_whole_seconds(path, t, "store them as integers")
         frames = _frames(path, file, layout)
         size = file.attrs.get("sensor_resolution")
         if size is not None:
@@ -71,7 +89,7 @@ def opened(path: Path) -> Iterator[Any]:
     numbers are expected, raise every kind.
     """
     check_readable(path, RecordingError)
-    with reading(path, Exception), h5py.File(path, "r") as file:
+    with reading(path, Exception), h5py.File(path, "r", rdcc_nbytes=CACHE) as file:
         yield file
 
 
@@ -124,7 +142,7 @@ def _columns(path: Path, file: Any, layout: str) -> tuple[Callable[[slice], Iter
     if len({column.shape for column in columns}) != 1 or columns[0].ndim != 1:
         found = ", ".join(f"{column.name} {column.shape}" for column in columns)
         raise RecordingError(f"{path}: its columns differ in length: {found}")
-    start = int(np.ravel(file["t_offset"])[0]) if "t_offset" in file and layout == "DSEC" else 0
+    start = _offset(path, file) if layout == "DSEC" and "t_offset" in file else 0
 
     def read(rows: slice) -> Iterable:
         t, *others = (column[rows] for column in columns)
@@ -133,6 +151,14 @@ def _columns(path: Path, file: Any, layout: str) -> tuple[Callable[[slice], Iter
         return t, *others
 
     return read, len(columns[0])
+
+
+def _offset(path: Path, file: Any) -> int:
+    """Microseconds, which DSEC's times leave out."""
+    offset = file["t_offset"]
+    if offset.size != 1:
+        raise RecordingError(f"{path}: t_offset has the shape {offset.shape}, expected one number")
+    return int(np.ravel(offset[()])[0])
 
 
 def check_stored(path: Path, data: Any):
@@ -230,8 +256,12 @@ def _mvsec_frames(path: Path, left: Any) -> Frames | None:
 
 def _frame(path: Path, name: str, index) -> np.ndarray:
     with opened(path) as file:
-        check_stored(path, file[name])
-        return to_frame(file[name][index], path)
+        pictures = file[name]
+        check_stored(path, pictures)
+        shape = pictures.shape if index is ... else pictures.shape[1:]
+        if math.prod(shape) > 4 * MOST_PIXELS:  # channels; what is not stored is not small, either
+            raise ValueError(f"{name} claims a picture of shape {shape}")
+        return to_frame(pictures[index], path)
 
 
 def _flow(path: Path, name: str) -> np.ndarray | None:

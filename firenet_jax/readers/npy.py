@@ -26,6 +26,7 @@ import numpy as np
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Frames, Rows
 from firenet_jax.readers import Source, frame_times, in_chunks, reading, size_of, text, to_frame
+from firenet_jax.storage.files import check_unpacking
 
 # layout: files of times, coordinates, polarities, frame times
 FILES = {
@@ -49,6 +50,7 @@ def read(path: Path, columns: str | None = None) -> Source:
     if layout is None:
         order = None if columns is None else _order(path, columns)
         t, *_ = _of_one_file(path, order)
+        text.warn_of_coarse_times(path, t)
         text.warn_of_whole_seconds(path, t, "store them as integers: a structured array, or .npz")
         return Source(
             f"numpy {path.suffix.lower()}",
@@ -61,6 +63,8 @@ def read(path: Path, columns: str | None = None) -> Source:
             f"{path}: has a file for each column, and so no order of columns: leave out --columns"
         )
     t, *_ = _columns(path, layout)
+    text.warn_of_coarse_times(path, t)
+    text.warn_of_whole_seconds(path, t, "store them as integers")
     frames = _frames(path, layout)
     size = _size(path)
     if size is None and frames is not None:
@@ -105,6 +109,7 @@ def _of_one_file(path: Path, order: list[str] | None) -> list[np.ndarray]:
     """-> t, x, y, p; order: of the columns of an (N, 4) array, if it was told."""
     if path.suffix.lower() == ".npz":
         with reading(path, Exception), zipfile.ZipFile(path) as archive:
+            check_unpacking(path, archive, RecordingError)
             if sum(info.file_size for info in archive.infolist()) > NPZ:
                 raise ValueError(f"claims more than {NPZ >> 30} GB")
         with reading(path, Exception), np.load(path, allow_pickle=False) as file:

@@ -74,9 +74,7 @@ def read(path: Path) -> Source:
         if first is not None and topics[topic] in PACKETS:
             grey = _packet(_Message(first, ros2)).encoding == "evt3"  # Prophesee: monochrome
         images = [t for t, kind in topics.items() if kind == IMAGE]
-        # Of several cameras' images, those whose topic begins alike: /dvs/events, /dvs/image_raw.
-        image_topic = max(images, key=lambda name: len(commonprefix([name, topic])), default=None)
-        frames = _frames(path, bag, image_topic)
+        frames = _frames(path, bag, _own_images(path, bag, images, topic))
     return Source(
         "ROS 2 bag" if ros2 else "ROS 1 bag",
         lambda: joined(_events(path, topic, topics[topic] in ARRAYS)),
@@ -85,6 +83,31 @@ def read(path: Path) -> Source:
         triggers=lambda: all_triggers(() if topics[topic] in ARRAYS else _triggers(path, topic)),
         grey=grey,
     )
+
+
+def _own_images(path: Path, bag: Any, images: list[str], topic: str) -> str | None:
+    """Of the topics of images the one whose name begins as that of the events does (/dvs/events,
+    /dvs/image_raw), among those whose pictures can be read: not depth, say."""
+    if len(images) > 1:
+        images = [name for name in images if _encoding(path, bag, name) in CHANNELS] or images
+    alike = {name: len(commonprefix([name, topic])) for name in images}
+    found = max(images, key=alike.__getitem__, default=None)
+    if found is not None and alike[found] <= 1 and "/" in found[1:] and "/" in topic[1:]:
+        logger.warning(
+            "%s: frames are those of %s, which may be another camera than that of %s",
+            path, _in_a_line(found), _in_a_line(topic),
+        )  # fmt: skip
+    return found
+
+
+def _encoding(path: Path, bag: Any, topic: str) -> str:
+    """That of a topic's first image; "" where there is none to be read."""
+    with contextlib.suppress(Exception):  # damaged bytes raise every kind
+        for _, raw in _raw(bag, topic):
+            message = _Message(raw, not _is_ros1(path))
+            message.header()
+            return _picture_head(message)[2]
+    return ""
 
 
 def _is_ros1(path: Path) -> bool:

@@ -32,6 +32,7 @@ from firenet_jax.errors import RecordingError, logger
 from firenet_jax.events import Events, Rows
 from firenet_jax.readers import Source, reading, to_events
 from firenet_jax.settings import LONGEST_SIDE
+from firenet_jax.storage.files import check_unpacking
 
 BLOCK = 1 << 21  # bytes parsed at once: about 90,000 events
 PIECE = 1 << 16  # bytes asked for at once: what a zip has unpacked of them is lost at damage
@@ -101,6 +102,7 @@ def opened(path: Path, member: str | None = None) -> Iterator[Any]:
         if member is not None:
             with reading(path, Exception):  # a damaged list of members raises every kind
                 archive = stack.enter_context(zipfile.ZipFile(path))
+                check_unpacking(path, archive, RecordingError)
                 stream = stack.enter_context(archive.open(member))
         else:
             compressed = path.suffix.lower() == ".gz"
@@ -246,9 +248,20 @@ def _whole(seconds: Iterable[float | str]) -> bool:
     return len(different) > 1 and all(map(float.is_integer, different))
 
 
+def warn_of_coarse_times(path: Path, t: np.ndarray, unit: str = "s") -> None:
+    """A warning where neighbouring times are more than a microsecond apart as they are stored."""
+    if t.dtype in (np.float16, np.float32) and len(t):
+        apart = float(np.spacing(np.abs(t[[0, -1]]).max())) * {"ms": 1e3, "us": 1.0}.get(unit, 1e6)
+        if apart > 1:
+            logger.warning(
+                "%s: t is %s, which tells these times apart by %.3g us: pass float64 or whole "
+                "microseconds, from before they were rounded", path, t.dtype, apart,
+            )  # fmt: skip
+
+
 def warn_of_whole_seconds(path: Path, t: np.ndarray, remedy: str) -> None:
     """Floating times are seconds; a warning says so where the first of them are whole ones."""
-    if t.dtype.kind == "f" and _whole(t[:SNIFFED].tolist()):
+    if t.dtype.kind == "f" and len(t) and _whole(t[:SNIFFED].tolist()):
         logger.warning(
             "%s: floating times: read as seconds, though whole ones; if they are microseconds, %s",
             path, remedy,

@@ -8,6 +8,7 @@ import contextlib
 import io
 import os
 import re
+import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
@@ -177,6 +178,17 @@ def read_lines(path: Path, what: str) -> list[str]:
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is no text"
         raise RecordingError(f"{path}: cannot read this {what}: {reason}") from error
+
+
+def check_unpacking(path: Path, archive: zipfile.ZipFile, error: type[ValueError]) -> None:
+    """Raises `error` where a member is compressed by bzip2 or LZMA: Python unpacks such a piece
+    whole, whatever size the archive states, so that a few bytes could take all memory."""
+    for info in archive.infolist():
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise error(
+                f"{path}: {info.filename!r} is compressed by another method than deflate, which is "
+                "not read: pack it anew, or unpack it"
+            )
 
 
 def publish(held: io.FileIO, beside: Path, path: Path) -> None:
