@@ -627,9 +627,12 @@ def test_everything_wrong_is_one_sentence(tmp_path, monkeypatch, capsys):
         ("-o new --seed -1", "seed is -1"),
         ("-o new --refractory 2.5", "a refractory period of 2.5 s, but at most 2.1 s"),
         ("-o new --refractory-range .001 5", "a refractory period of 5 s"),
-        ("-o new --asymmetry .3 --faults", "--asymmetry says more of --threshold-range"),
-        ("-o new --noise-in-light .1 .5", "--noise-in-light says more of --noise"),
-        ("-o new --cutoff-dark .5 --faults --cutoff 0 0", "--cutoff-dark says more of --cutoff"),
+        ("-o new --asymmetry .3 --faults", "--asymmetry has no effect without --threshold-range"),
+        ("-o new --noise-in-light .1 .5", "--noise-in-light has no effect without --noise"),
+        (
+            "-o new --cutoff-dark .5 --faults --cutoff 0 0",
+            "--cutoff-dark has no effect without --cutoff",
+        ),
         (
             "-o new.h5 --video clip.mp4 --fps 5 --objects 7",
             "fps, objects: no effect with turning",

@@ -429,8 +429,9 @@ def test_video_gives_each_time_its_picture(scenes):
     "choice, message",
     [
         ({"speed": (0.0, 100.0)}, "speed is 0 100, but is drawn log-uniformly"),
-        ({"zoom": (1.0, 0.5)}, "the least first"), ({"pause": 1.5}, "a probability"),
-        ({"shake": -0.1}, "a probability"), ({"shake_pixels": (0.0, 1.0)}, "shake_pixels is 0 1"),
+        ({"zoom": (1.0, 0.5)}, "the least first"), ({"pause": 1.5}, "a share of the scenes"),
+        ({"shake": -0.1}, "a share of the scenes"),
+        ({"shake_pixels": (0.0, 1.0)}, "shake_pixels is 0 1"),
         ({"blur": (0.0, 0.5)}, "more than 0"),
         ({"shake_pixels": (1.0, 2.0)}, "--shake-pixels has no effect without --shake"),
         ({"blur": (5.0, 5.0)}, "one of 13.3 texture pixels, but at most 8"),

@@ -319,7 +319,7 @@ def test_faults_are_switched_on_but_what_is_given_stays():
     [
         ({"noise": (0.0, 10.0)}, "noise is 0 10, but is drawn log-uniformly"),
         ({"noise_in_light": (0.0, 1.0)}, "noise_in_light is 0 1, but is drawn log-uniformly"),
-        ({"leak": (0.5, 0.1)}, "the least first"), ({"hot": (0.5, 5.0)}, "part of the pixels"),
+        ({"leak": (0.5, 0.1)}, "the least first"), ({"hot": (0.5, 5.0)}, "share of the pixels"),
         ({"cutoff": (1.0, np.nan)}, "cutoff"), ({"threshold_range": (0.0, 1.0)}, "threshold_range"),
         ({"flicker": (0.5, 1.5)}, "light is not negative"),
         ({"flicker": (0.0, 0.5)}, "flicker is 0 0.5"),
@@ -357,7 +357,7 @@ def test_sensors_at_the_edge_of_what_can_be(choice):
         ({"refractory_range": (1e-3, MAX_INTERVAL * 1.1e-6)}, "at most 2.1 s"),
         ({"clean": -0.1}, "clean is -0.1"), ({"clean": 1.1}, "clean is 1.1"),
         ({"threshold": 0.0}, "threshold is 0"), ({"cutoff_dark": -0.1}, "cutoff_dark is"),
-        ({"hot": (0.5, 1.01)}, "part of the pixels"), ({"flicker": (0.5, 1.01)}, "at most 1"),
+        ({"hot": (0.5, 1.01)}, "share of the pixels"), ({"flicker": (0.5, 1.01)}, "at most 1"),
         ({"threshold_spread": 0.1, "threshold_range": (0.1, 0.6)}, "pass --asymmetry"),
     ],
 )  # fmt: skip
