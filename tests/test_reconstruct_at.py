@@ -130,6 +130,14 @@ def test_a_video_keeps_the_times(tmp_path, weights):  # noqa: F811
     np.testing.assert_allclose(found, 10 * (np.array(wanted) - wanted[0]), atol=2e-5)
 
 
+def test_a_mistyped_list_leaves_no_folder(tmp_path, weights):  # noqa: F811
+    recording, nothing = write_recording(tmp_path / "a.txt", 50), tmp_path / "none"
+    for wrong in ({"times": Times(at=nothing)}, {"hot_pixels": str(nothing)}):
+        with pytest.raises(RecordingError, match="none: there is no such file or folder"):
+            run(settings(weights, (recording,), tmp_path / "new/a.mp4", **wrong))
+    assert not (tmp_path / "new").exists()
+
+
 def test_times_outside_of_a_recording(tmp_path, weights, caplog):  # noqa: F811
     recording = write_recording(tmp_path / "a.txt", 500)
     for text, name in (("-5s\n0.5s\n7s\n8s\n", "some"), ("7s\n", "none")):

@@ -190,8 +190,9 @@ def run(settings: Reconstruct) -> list[Path]:
     process, processes = process_of(settings.process, settings.processes)
     mine = slice(process, None, processes)
     planned = plan(settings.recordings, settings.output)
-    for path in settings.recordings:  # a slip, not damage: before all, and before folders are made
-        check_exists(path)
+    lists = [settings.times.at, None if settings.hot_pixels == "auto" else settings.hot_pixels]
+    for path in (*settings.recordings, *filter(None, lists)):
+        check_exists(Path(path))  # a slip, not damage: before all, and before folders are made
     outputs = planned[mine]
     if not outputs:
         return []
