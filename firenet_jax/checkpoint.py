@@ -7,6 +7,7 @@ whatever loads also runs. Anything else raises CheckpointError, which names the 
 """
 
 import contextlib
+import hashlib
 import importlib.resources
 import os
 import zipfile
@@ -14,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
@@ -51,6 +53,14 @@ for _layer, (_size, _inputs, _outputs) in LAYERS.items():
 # ---- npz
 
 
+def digest(tree) -> str:
+    """Arrays under names -> a short text that differs where any of them does."""
+    found = hashlib.sha256()
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        found.update(jax.tree_util.keystr(path).encode() + np.asarray(leaf).tobytes())
+    return found.hexdigest()[:16]
+
+
 def save_weights(path: str | Path, weights: Weights) -> None:
     """Writes a temporary file and renames it, so the file is always complete.
 
@@ -84,7 +94,7 @@ def _of_a_run(folder: Path) -> Path:
     for name in ("weights.npz", "last.npz"):
         if (folder / name).is_file():
             return folder / name
-    if (folder / "settings.json").is_file():
+    if (folder / "log.jsonl").is_file():
         raise CheckpointError(
             f"{folder} has no weights yet: the run writes them at its first validation "
             "(--validate-every) or when it is stopped by Ctrl-C; let it go on"

@@ -4,6 +4,7 @@ A command is a module with a frozen dataclass of settings and a function `run(se
 imported only when the command is called, so `firenet --help` does not load jax.
 """
 
+import _thread
 import contextlib
 import ctypes
 import difflib
@@ -13,6 +14,7 @@ import io
 import logging
 import os
 import sys
+import threading
 
 from firenet_jax.errors import FirenetError
 
@@ -152,6 +154,26 @@ def sentence(error: Exception, command: str) -> str | None:
     return str(error) if isinstance(error, (FirenetError, OSError)) else None
 
 
+@contextlib.contextmanager
+def _no_interrupt_lost():
+    """Ctrl-C raises wherever Python is; what is raised in a callback of its garbage collector, as
+    JAX has one, or in a finaliser, is dropped. Meanwhile it is raised again, a little later."""
+    before = sys.unraisablehook
+
+    def again(what):
+        if not issubclass(what.exc_type, KeyboardInterrupt):
+            return before(what)
+        later = threading.Timer(0.05, _thread.interrupt_main)  # not in this very callback
+        later.daemon = True
+        later.start()
+
+    sys.unraisablehook = again
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command; returns the exit code.
 
@@ -187,9 +209,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         from firenet_jax.commands import options
 
-        command = importlib.import_module(f"firenet_jax.commands.{name}")
-        kind = getattr(command, name.capitalize())
-        command.run(options.parse(kind, rest, f"firenet {name}", inspect.getdoc(kind) or ""))
+        with _no_interrupt_lost():
+            command = importlib.import_module(f"firenet_jax.commands.{name}")
+            kind = getattr(command, name.capitalize())
+            command.run(options.parse(kind, rest, f"firenet {name}", inspect.getdoc(kind) or ""))
     except KeyboardInterrupt as error:
         goes_on = str(error) or GOES_ON.get(name)
         print("firenet: interrupted" + (f"; {goes_on}" if goes_on else ""), file=sys.stderr)

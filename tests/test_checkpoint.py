@@ -242,7 +242,10 @@ def test_missing(tmp_path, name):
 def test_folder_without_weights(tmp_path):
     with pytest.raises(CheckpointError, match="is a folder, but not of a training run; pass"):
         load_weights(tmp_path)
-    (tmp_path / "settings.json").write_text("{}")
+    (tmp_path / "settings.json").write_text("{}")  # as simulated sequences have
+    with pytest.raises(CheckpointError, match="is a folder, but not of a training run; pass"):
+        load_weights(tmp_path)
+    (tmp_path / "log.jsonl").write_text("")
     with pytest.raises(CheckpointError, match="has no weights yet: .*--validate-every"):
         load_weights(tmp_path)
 

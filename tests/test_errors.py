@@ -1,5 +1,8 @@
 """Which exceptions the command line turns into a sentence, and which it shows as they are."""
 
+import gc
+import sys
+import time
 import traceback
 
 import pytest
@@ -46,6 +49,26 @@ def test_a_fault_of_ours_shows_where_it_is_and_asks_for_a_report(monkeypatch, ki
         "firenet: this is a bug in firenet, not a mistake of yours"
     )
     assert "test_errors.py" in said and "Traceback" in said
+
+
+def test_ctrl_c_in_a_callback_of_the_garbage_collector_is_not_lost(monkeypatch, capsys):
+    """Python drops what such a callback raises; JAX has one."""
+
+    def collected(phase, found):
+        if gc.callbacks.count(collected):
+            gc.callbacks.remove(collected)
+            raise KeyboardInterrupt
+
+    def run(settings):
+        gc.callbacks.append(collected)
+        gc.collect()
+        time.sleep(30)
+
+    monkeypatch.setattr(info, "run", run)
+    before = sys.unraisablehook
+    assert cli.main(["info", "a.txt"]) == 130
+    assert capsys.readouterr().err == "firenet: interrupted\n"
+    assert sys.unraisablehook is before
 
 
 def test_settings_errors_name_what_can_be():

@@ -23,7 +23,7 @@ from skimage.metrics import structural_similarity
 
 import firenet_jax
 from firenet_jax import cli
-from firenet_jax.checkpoint import load_weights, save_weights
+from firenet_jax.checkpoint import digest, load_weights, save_weights
 from firenet_jax.commands import evaluate, options
 from firenet_jax.commands.evaluate import Evaluate, run
 from firenet_jax.commands.times import Times
@@ -32,7 +32,7 @@ from firenet_jax.evaluation import comparison, methods, metrics, protocol
 from firenet_jax.evaluation.baselines import e2vid
 from firenet_jax.evaluation.baselines.high_pass import HighPass
 from firenet_jax.evaluation.comparison import COMPARED, Gap, matched
-from firenet_jax.evaluation.methods import Missing, digest, filtered, load, recurrent_unet
+from firenet_jax.evaluation.methods import Missing, filtered, load, recurrent_unet
 from firenet_jax.evaluation.protocol import CUTS, displacement, plan
 from firenet_jax.evaluation.report import METRICS, _best, about, notes
 from firenet_jax.evaluation.report import steps as ticks_of
@@ -335,6 +335,17 @@ def test_numbers_of_an_earlier_run_that_are_not_whole_are_named(folder, tmp_path
     np.savez(path.with_suffix(".npz"), a=1)
     with pytest.raises(OutputError, match="hf.npz is damaged .*: remove it"):
         run(ours)
+
+
+def test_a_report_of_other_settings_is_not_replaced(folder, tmp_path):
+    ours = partial(settings, folder, tmp_path / "out", data=(folder / "data" / "a.h5",))
+    run(ours(methods="mr", keep_ratio=0.5))
+    page = (tmp_path / "out" / "index.html").read_bytes()
+    with pytest.raises(OutputError, match=r"holds a report with other settings \(keep_ratio was"):
+        run(ours(methods="hf"))
+    assert (tmp_path / "out" / "index.html").read_bytes() == page
+    run(ours(methods="hf", overwrite=True))
+    assert (tmp_path / "out" / "index.html").read_bytes() != page
 
 
 def test_damaged_pictures_of_an_earlier_run_are_named(folder, tmp_path):

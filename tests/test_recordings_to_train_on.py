@@ -187,6 +187,12 @@ def test_a_run_keeps_to_its_recordings(tmp_path, folder):
     written = {path: path.stat().st_mtime_ns for path in settings.sequences.rglob("*.h5")}
     recordings.write_sequences([recordings.cut_off(folder, 3)], settings)
     assert {p: p.stat().st_mtime_ns for p in settings.sequences.rglob("*.h5")} == written
+    path = settings.sequences / "settings.json"
+    record = json.loads(path.read_text())
+    record["recordings"][0].append(123)  # as runs of before wrote: a time, which copies have not
+    path.write_text(json.dumps(record))
+    recordings.write_sequences([recordings.cut_off(folder, 3)], settings)
+    assert {p: p.stat().st_mtime_ns for p in settings.sequences.rglob("*.h5")} == written
     for data, windows in (((other,), 3), ((folder,), 5)):
         changed = dataclasses.replace(settings, data=data)
         with pytest.raises(OutputError, match="holds sequences of others"):

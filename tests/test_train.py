@@ -329,6 +329,48 @@ def begun(folder, settings):
     train._keep_settings(folder, settings)
 
 
+def test_a_run_that_began_with_other_weights_is_told(tmp_path, caplog):
+    params = initial_params(jax.random.key(0))
+    path, folder = tmp_path / "w.npz", tmp_path / "run"
+    save_weights(path, Weights(params, normalise=True))
+    begun(folder, tiny(folder, weights=path))
+    train._check_folder(folder, tiny(folder, weights=path))
+    assert "has changed" not in caplog.text
+    save_weights(path, Weights(jax.tree.map(lambda leaf: leaf + 1, params), normalise=True))
+    for _ in range(2):  # it began with the first ones, however often it goes on
+        caplog.clear()
+        begun(folder, tiny(folder, weights=path))
+        assert "w.npz has changed since the run in" in caplog.text
+    path.unlink()
+    caplog.clear()
+    begun(folder, tiny(folder, weights=path))
+    save_weights(path, Weights(params, normalise=True))
+    begun(folder, tiny(folder, weights=path))
+    assert "has changed" not in caplog.text
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_without_the_weights_that_it_began_with(tmp_path, caplog):
+    weights = Weights(initial_params(jax.random.key(7)), normalise=True)
+    for name in ("all", "parts"):
+        save_weights(tmp_path / "w.npz", weights)
+        choices = {"weights": tmp_path / "w.npz", "steps": 4}
+        if name == "parts":
+            run(tiny(tmp_path / name, **choices), stop=2)
+            (tmp_path / "w.npz").unlink()
+        run(tiny(tmp_path / name, **choices))
+    assert "going on after step 2" in caplog.text
+    np.testing.assert_array_equal(
+        *(load_weights(tmp_path / name).params["head"]["kernel"] for name in ("all", "parts"))
+    )
+
+
+def test_the_folder_of_a_simulation_is_none_of_a_run(tmp_path):
+    (tmp_path / "settings.json").write_text('{"seed": 0, "sequences": 5}')
+    with pytest.raises(OutputError, match="is a folder of something else: choose another"):
+        train._check_folder(tmp_path, tiny(tmp_path))
+
+
 def test_other_settings_do_not_continue_a_run(tmp_path):
     begun(tmp_path, tiny(tmp_path))
     train._check_folder(tmp_path, tiny(tmp_path))

@@ -24,13 +24,14 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import tyro
 
+from firenet_jax.checkpoint import digest
 from firenet_jax.commands import options
 from firenet_jax.commands.times import Times, read_times, times_of
 from firenet_jax.errors import OutputError, RecordingError, SettingsError, logger
 from firenet_jax.evaluation import lpips, report
 from firenet_jax.evaluation.comparison import Gap, Plan, matched, to_8_bit
 from firenet_jax.evaluation.equalise import Kind, equalise
-from firenet_jax.evaluation.methods import METHODS, Method, Missing, digest, load
+from firenet_jax.evaluation.methods import METHODS, Method, Missing, load
 from firenet_jax.evaluation.protocol import Protocol, evaluate, plan, steps_of, until
 from firenet_jax.evaluation.results import METRICS, Measured, mean, summary
 from firenet_jax.events import Recording
@@ -169,7 +170,7 @@ def run(settings: Evaluate) -> dict:
         if isinstance(method, Method)
     }
     with alone_in(settings.output):
-        done = open_folder(settings, records)
+        done = open_folder(settings, shared, records)
 
         plans: dict[str, Plan] = {}
         gaps = {
@@ -317,11 +318,12 @@ def result_file(settings: Evaluate, sequence: str, method: str) -> Path:
 
 
 def open_folder(
-    settings: Evaluate, records: dict[tuple[str, str], dict]
+    settings: Evaluate, shared: dict, records: dict[tuple[str, str], dict]
 ) -> dict[tuple[str, str], Measured]:
     """Makes the output folder; returns the results of an earlier run that belong to this one.
 
-    Raises OutputError where a result was made by other settings, which `overwrite` replaces.
+    shared: what all records have (`describe`). Raises OutputError where the report or a result was
+    made by other settings, which `overwrite` replaces.
     """
     folder = settings.output
     report = read_record(folder / "results.json", "choose another output")
@@ -331,6 +333,10 @@ def open_folder(
         mine = mine and all(path.is_dir() for path in folder.glob("results/*"))
     if any(folder.iterdir()) and not ((folder / "results").is_dir() and mine):
         raise OutputError(f"{folder} is a folder of something else: choose another output")
+    other = "choose another output, or pass --overwrite to compute it again"
+    if report is not None and not settings.overwrite:
+        was = report.get("settings", {})
+        check_same(was, shared, f"{folder} holds a report with other settings", other, ["version"])
     done = {}
     for key, record in records.items():
         path = result_file(settings, *key)
@@ -345,10 +351,7 @@ def open_folder(
         except (KeyError, TypeError, ValueError, AttributeError, ZeroDivisionError) as error:
             raise OutputError(f"{path} is damaged ({error}): remove it") from error
         if not settings.overwrite:
-            check_same(
-                was, record, f"{path} was made with other settings",
-                "choose another output, or pass --overwrite to compute it again",
-            )  # fmt: skip
+            check_same(was, record, f"{path} was made with other settings", other)
         if not differences(was, record):
             done[key] = result
         else:  # what takes its place may be a gap

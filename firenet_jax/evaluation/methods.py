@@ -10,7 +10,6 @@ compiles for each of a few window sizes (`tensors.CAPACITIES`).
 """
 
 import dataclasses
-import hashlib
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -18,9 +17,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from firenet_jax.checkpoint import load_weights
+from firenet_jax.checkpoint import digest, load_weights
 from firenet_jax.errors import SettingsError, logger
 from firenet_jax.evaluation.baselines import e2vid, high_pass, manifold
 from firenet_jax.instants import Step
@@ -187,14 +185,6 @@ def look(method: Method, before: Any, last: Any, step: Step) -> jax.Array:
         return method.step(last, Window(events, step.time))[1]
     state = method.between(step.share, before, last)
     return method.step(state, Window(step.events, step.time))[1]
-
-
-def digest(tree) -> str:
-    """Arrays under names -> a short text that differs where any of them does."""
-    found = hashlib.sha256()
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        found.update(jax.tree_util.keystr(path).encode() + np.asarray(leaf).tobytes())
-    return found.hexdigest()[:16]
 
 
 def _tensor(window: Window, height: int, width: int) -> jax.Array:

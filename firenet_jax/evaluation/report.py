@@ -19,8 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from firenet_jax.checkpoint import load_weights
-from firenet_jax.evaluation.methods import digest
+from firenet_jax.checkpoint import digest, load_weights
 from firenet_jax.evaluation.results import METRICS
 from firenet_jax.events import Events
 

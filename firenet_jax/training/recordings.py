@@ -137,11 +137,12 @@ def write_sequences(cuts: list[Cut], settings: Train) -> None:
     """
     folder = settings.sequences
     held = [len(one.frames.times) - 1 - one.end for one in cuts]
-    record = {"recordings": [identity(path) for path in settings.data], "held_out": held}
+    record = {"recordings": [_named(path) for path in settings.data], "held_out": held}
     with runs.alone_in(folder):
         way_out = "choose another --output"
         found = runs.read_record(folder / "settings.json", way_out)
         if found is not None:
+            found["recordings"] = [one[:2] for one in found["recordings"]]  # of before: and times
             runs.check_same(found, record, f"{folder} holds sequences of others", way_out)
         write_text(folder / "settings.json", runs.as_text(record))
         runs.make_folder(folder / "validation")
@@ -153,6 +154,11 @@ def write_sequences(cuts: list[Cut], settings: Train) -> None:
             for path in (*new, *([folder / "settings.json"] if found is None else [])):
                 path.unlink(missing_ok=True)
             raise
+
+
+def _named(path: Path) -> list:
+    """Name and size of a recording, which a copy has, too."""
+    return identity(path)[:2]
 
 
 def _parts(cuts: list[Cut], folder: Path) -> dict[Path, tuple[Cut, int, int | None]]:

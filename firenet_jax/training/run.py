@@ -20,6 +20,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from jax.experimental import multihost_utils
 
-from firenet_jax.checkpoint import load_weights
+from firenet_jax.checkpoint import BUILT_IN, digest, load_weights
 from firenet_jax.devices import TIME_BATCH, is_first, join, replicated, sharding
 from firenet_jax.errors import CheckpointError, FirenetError, OutputError, SettingsError, logger
 from firenet_jax.network import Weights, initial_params
@@ -73,7 +74,7 @@ def run(
         )
     folder = settings.output
     _check_folder(folder, settings)
-    state = first_state(settings)
+    state = first_state(_without_what_is_saved(settings))
     options = ocp.CheckpointManagerOptions(max_to_keep=2)
     with (
         locked(folder) if is_first() else contextlib.nullcontext(),  # the others do not write
@@ -115,6 +116,13 @@ def run(
         raise KeyboardInterrupt(f"step {done} is saved: the same command goes on from there")
     if is_first():
         _say_result(folder, done, best)
+
+
+def _without_what_is_saved(settings: Train) -> Train:
+    """The settings without weights to begin with, where a checkpoint has all that came of them: by
+    now they may be gone."""
+    saved = (settings.output / "checkpoints").glob("*")
+    return replace(settings, weights=None) if any(p.name.isdecimal() for p in saved) else settings
 
 
 def _say_result(folder: Path, done: int, best: float) -> None:
@@ -278,7 +286,8 @@ def _record(settings: Train) -> dict:
     """Everything that the weights depend on, and how often a run is logged and saved."""
     data = settings.data[0] if len(settings.data) == 1 else list(settings.data) or None
     but = "output", "coordinator", "processes", "process"
-    return runs.recorded(settings, but=but, data=data, files=_files(settings))
+    told = {"files": _files(settings), "initial": _initial(settings)}
+    return runs.recorded(settings, but=but, data=data, **told)
 
 
 def _files(settings: Train) -> str | None:
@@ -291,6 +300,17 @@ def _files(settings: Train) -> str | None:
     return hashlib.sha256(repr(found).encode()).hexdigest()[:16]
 
 
+def _initial(settings: Train) -> str | None:
+    """The weights that a run begins with, in short. None: random ones, the built-in ones, or those
+    of a file that is gone, which a run that goes on does not need."""
+    if settings.weights is None or str(settings.weights) == BUILT_IN:
+        return None
+    try:
+        return digest(load_weights(settings.weights))
+    except CheckpointError:
+        return None
+
+
 def _check_folder(folder: Path, settings: Train) -> None:
     """Makes it, if it is missing. Raises OutputError for a folder of somebody else, or of a run
     with other settings."""
@@ -298,6 +318,8 @@ def _check_folder(folder: Path, settings: Train) -> None:
         raise OutputError(f"{folder} is a file, but a run needs a folder: choose another --output")
     runs.make_folder(folder)
     found = runs.read_record(folder / "settings.json", "choose another --output")
+    if found is not None and "learning_rate" not in found:
+        raise OutputError(f"{folder} is a folder of something else: choose another --output")
     if found is not None:
         _check_settings(folder, found, settings)
         return
@@ -317,12 +339,17 @@ def _check_settings(folder: Path, found: dict, settings: Train) -> None:
     now = _record(settings)
     if found.get("files") is None:  # a run of before it was kept
         found["files"] = now["files"]
+    if found.get("initial") not in (None, now["initial"]) and now["initial"] is not None:
+        logger.warning(
+            "%s has changed since the run in %s began, which goes on from its own weights: to "
+            "begin with these, choose another --output", settings.weights, folder,
+        )  # fmt: skip
     if found.get("warmup") == 200 and settings.warmup is None:  # of before the default was None
         found["warmup"] = None
     found = runs.completed(found, _record(Train(folder)))
     done = (folder / "checkpoints" / str(found["steps"])).is_dir()
     longer = isinstance(found["steps"], int) and found["steps"] < settings.steps
-    if longer and done and not runs.differences(found, now, but=(*UNRECORDED, "steps")):
+    if longer and done and not runs.differences(found, now, but=(*UNRECORDED, "steps", "initial")):
         logger.warning(
             "%s: its %d steps are done: it goes on to %d, with the rate of a run so long",
             folder, found["steps"], settings.steps,
@@ -335,12 +362,16 @@ def _check_settings(folder: Path, found: dict, settings: Train) -> None:
             f"{what} has changed since the run in {folder} began: choose another --output, with "
             f"--weights {folder} to begin with its weights"
         )
+    may_change = (*UNRECORDED, "files", "initial")
     runs.check_same(
         found, now, f"{folder} holds a run with other settings",
-        "choose another --output, or go on with the same settings", but=(*UNRECORDED, "files"),
+        "choose another --output, or go on with the same settings", but=may_change,
     )  # fmt: skip
 
 
 def _keep_settings(folder: Path, settings: Train) -> None:
     if is_first():  # only one process writes
-        write_text(folder / "settings.json", runs.as_text(_record(settings)))
+        path, record = folder / "settings.json", _record(settings)
+        before = runs.read_record(path, "choose another --output") or {}
+        record["initial"] = before.get("initial") or record["initial"]  # it began once
+        write_text(path, runs.as_text(record))
