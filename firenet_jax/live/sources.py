@@ -39,7 +39,6 @@ BINARY = {
     "t32_x16_y15_on1": np.dtype([("t", "<u4"), ("x", "<u2"), ("y_on", "<u2")]),
 }
 FRACTION = b".", b"e", b"E"  # of which a number of seconds has one
-WIRES = (*BINARY, "text")
 NO_EVENTS = Events.empty()
 
 

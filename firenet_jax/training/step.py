@@ -301,12 +301,7 @@ def loss_of(
 
 
 def _updated(
-    state: TrainState,
-    data: Simulation,
-    before: State | None,
-    warm,
-    settings: StepSettings,
-    near=False,
+    state: TrainState, data: Simulation, before: State | None, warm, settings: StepSettings, near
 ):
     """(state, data, the network's state before it) -> (state, losses), the network's state."""
     both = jax.value_and_grad(loss_of, has_aux=True)
