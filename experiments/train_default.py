@@ -1207,6 +1207,18 @@ HOLDING = {  # the mean that each begins from, its settings, how it holds
 # equalisation, is no better than EAGERS in their dense windows (.627 : .625 of equalised SSIM;
 # published .646), so that what is missing there is not a matter of what counts.
 LAST_MEAN = mixed((EAGERS, 2), ({"placid": 1, "patient": 1}, 2))
+# Two that are in no mean; their last weights are in results/stages/. At a seventh of the rate,
+# which stayed as it was for half of the time and then fell in a line to a fiftieth, with a longer
+# average (0.998), a stage is no worse than the mean that it begins from; alone, all at the full
+# rate are.
+# "gentle" from LAST_MEAN, 36 minutes beside other work: a twentieth more contrast, and brighter.
+# "gentler" from there, 31 minutes: sparse windows of faulty sensors are better than with any
+# weights before, and davis346_frames comes back from forty rounds at .914.
+GENTLE = replace(FAITHFUL, steps=687, slow=0.04, learning_rate=1.5e-4, seed=2012,
+                 sensor=replace(FINE.sensor, clean=0.4))  # fmt: skip
+GENTLER = replace(GENTLE, steps=721, motion=(0.4, 40.0), slow=0.06, seed=2021,
+                  loss=replace(GENTLE.loss, l1=3.0),
+                  sensor=replace(FINE.sensor, clean=0.35))  # fmt: skip
 # The candidate of the second ConvGRU has this share of that of DUSKY, which "vast" began from; the
 # rest is, up to "rapid", that of "vast", and later of the mean itself. More of it remembers better
 # what goes to and fro, and rests less well. FORMER had half.
