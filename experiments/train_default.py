@@ -1209,7 +1209,7 @@ HOLDING = {  # the mean that each begins from, its settings, how it holds
 LAST_MEAN = mixed((EAGERS, 2), ({"placid": 1, "patient": 1}, 2))
 # Two that are in no mean; their last weights are in results/stages/. At a seventh of the rate,
 # which stayed as it was for half of the time and then fell in a line to a fiftieth, with a longer
-# average (0.998), a stage is no worse than the mean that it begins from; alone, all at the full
+# average (0.998), a stage is no worse than the mean that it begins from; alone, most at the full
 # rate are.
 # "gentle" from LAST_MEAN, 36 minutes beside other work: a twentieth more contrast, and brighter.
 # "gentler" from there, 31 minutes: sparse windows of faulty sensors are better than with any
