@@ -4,6 +4,7 @@ data outside the repository, and which tests run in one process (`-n 2`).
 
 import os
 import shutil
+import signal
 import tempfile
 from pathlib import Path
 
@@ -127,3 +128,11 @@ def each_way(request):
         jax.clear_caches()
         yield
     jax.clear_caches()
+
+
+@pytest.fixture
+def interrupts():
+    """Ctrl-C interrupts: a shell starts what runs in the background so that it is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

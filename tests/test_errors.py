@@ -51,7 +51,7 @@ def test_a_fault_of_ours_shows_where_it_is_and_asks_for_a_report(monkeypatch, ki
     assert "test_errors.py" in said and "Traceback" in said
 
 
-def test_ctrl_c_in_a_callback_of_the_garbage_collector_is_not_lost(monkeypatch, capsys):
+def test_ctrl_c_in_a_callback_of_the_garbage_collector_is_not_lost(monkeypatch, capsys, interrupts):
     """Python drops what such a callback raises; JAX has one."""
 
     def collected(phase, found):

@@ -573,7 +573,9 @@ def test_nothing_runs_on_after_an_error_that_is_kept(tmp_path, weights, monkeypa
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no signal reaches a thread there")
-def test_an_interrupted_run_does_not_wait_for_what_is_read(tmp_path, weights, monkeypatch):
+def test_an_interrupted_run_does_not_wait_for_what_is_read(
+    tmp_path, weights, monkeypatch, interrupts
+):
     """Such as before --start: nothing comes to the device, and nothing looks whether it is to."""
     recording = open_recording(write_recording(tmp_path / "a.txt"))
     begun = time.monotonic()

@@ -504,14 +504,6 @@ def test_a_short_run_warms_up_in_fewer_steps(tmp_path):
     assert train_settings.warming_up(Train(tmp_path, steps=300, warmup=200)) == 200
 
 
-@pytest.fixture
-def interrupts():
-    """Ctrl-C interrupts: a shell starts what runs in the background so that it is ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.slow
 def test_a_finished_run_is_lengthened_and_ctrl_c_saves(tmp_path, monkeypatch, caplog, interrupts):
     run(tiny(tmp_path, steps=2))

@@ -301,7 +301,12 @@ def loss_of(
 
 
 def _updated(
-    state: TrainState, data: Simulation, before: State | None, warm, settings: StepSettings, near
+    state: TrainState,
+    data: Simulation,
+    before: State | None,
+    warm,
+    settings: StepSettings,
+    near=False,
 ):
     """(state, data, the network's state before it) -> (state, losses), the network's state."""
     both = jax.value_and_grad(loss_of, has_aux=True)
