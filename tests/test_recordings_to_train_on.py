@@ -344,6 +344,17 @@ def test_an_end_without_events_is_judged_by_nothing(tmp_path):
     assert recordings.judged(weights, one._replace(end=7), near=False).frames == 0
 
 
+def test_weights_that_are_gone_are_not_judged(tmp_path, folder, capsys, caplog):
+    settings = tiny(tmp_path / "run", data=(folder,), weights=tmp_path / "gone.npz")
+    (tmp_path / "run").mkdir()
+    params = initial_params(jax.random.key(1))
+    save_weights(tmp_path / "run/weights.npz", Weights(params, True))
+    recordings.print_scores([recordings.cut_off(folder, 3)], settings)
+    said = capsys.readouterr().out
+    assert "of the 3 frames held out" in said and " before" not in said
+    assert "gone.npz does not exist" in caplog.text
+
+
 @pytest.mark.slow
 def test_training_on_a_recording_tells_before_and_after(tmp_path, folder, capsys):
     line = ["train", "-o", str(tmp_path / "run"), "--data", str(folder), str(folder / "../noise")]

@@ -144,11 +144,11 @@ class Running:
         self.reached += len(taken)
         self.pictures += sum(step.time is not None for step in taken)
         if self.ahead is None and self.error is None and self.counts is not None:
-            self.error = check_coverage(self.job.recording, self.counts)
+            self.error = coverage_error(self.job.recording, self.counts)
         return taken
 
 
-def check_coverage(recording: Recording, counts: Counts) -> RecordingError | None:
+def coverage_error(recording: Recording, counts: Counts) -> RecordingError | None:
     """Says which times lie outside the recording; an error where all do."""
     if not counts.seen:
         return RecordingError(

@@ -259,7 +259,7 @@ def _frame(path: Path, name: str, index) -> np.ndarray:
         pictures = file[name]
         check_stored(path, pictures)
         shape = pictures.shape if index is ... else pictures.shape[1:]
-        if math.prod(shape) > 4 * MOST_PIXELS:  # channels; what is not stored is not small, either
+        if math.prod(shape) > 4 * MOST_PIXELS:  # of 4 channels; no file need hold what it claims
             raise ValueError(f"{name} claims a picture of shape {shape}")
         return to_frame(pictures[index], path)
 

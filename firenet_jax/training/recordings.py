@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from firenet_jax.checkpoint import load_weights
-from firenet_jax.errors import RecordingError, logger
+from firenet_jax.errors import CheckpointError, RecordingError, logger
 from firenet_jax.evaluation import metrics
 from firenet_jax.evaluation.comparison import Gap
 from firenet_jax.evaluation.equalise import equalise
@@ -137,7 +137,8 @@ def write_sequences(cuts: list[Cut], settings: Train) -> None:
     """
     folder = settings.sequences
     held = [len(one.frames.times) - 1 - one.end for one in cuts]
-    record = {"recordings": [_named(path) for path in settings.data], "held_out": held}
+    named = [identity(path)[:2] for path in settings.data]  # name and size, which a copy has, too
+    record = {"recordings": named, "held_out": held}
     with runs.alone_in(folder):
         way_out = "choose another --output"
         found = runs.read_record(folder / "settings.json", way_out)
@@ -154,11 +155,6 @@ def write_sequences(cuts: list[Cut], settings: Train) -> None:
             for path in (*new, *([folder / "settings.json"] if found is None else [])):
                 path.unlink(missing_ok=True)
             raise
-
-
-def _named(path: Path) -> list:
-    """Name and size of a recording, which a copy has, too."""
-    return identity(path)[:2]
 
 
 def _parts(cuts: list[Cut], folder: Path) -> dict[Path, tuple[Cut, int, int | None]]:
@@ -219,8 +215,14 @@ class Score(NamedTuple):
 
 
 def print_scores(cuts: list[Cut], settings: Train) -> None:
-    """One line a recording: SSIM of its held-out end before and after."""
-    before = load_weights(settings.weights) if settings.weights is not None else None
+    """One line a recording: SSIM of its held-out end before and after; not before, where a run went
+    on without the weights that it began with."""
+    before = None
+    if settings.weights is not None:
+        try:
+            before = load_weights(settings.weights)
+        except CheckpointError as error:
+            logger.warning("%s", error)
     after = load_weights(settings.output / "weights.npz")
     where = " where events were" if settings.near_events else ""
     for one in cuts:
