@@ -142,7 +142,7 @@ def _backward(machine_code, activations, kept, gradients):
 def parameter_gradients(machine_code: bool, maps, kernel, gradients) -> tuple[jax.Array, jax.Array]:
     """Gradients of kernel and bias, from those of the layer's pre-activations."""
 
-    def by_xla(maps, kernel, gradients):
+    def gradients_by_xla(maps, kernel, gradients):
         by = partial(jax.lax.platform_dependent, cpu=kernel_gradient, default=_xla_kernel_gradient)
         joined = _joined(gradients)
         # Summed in float32, whatever the gradients' type.
@@ -150,7 +150,7 @@ def parameter_gradients(machine_code: bool, maps, kernel, gradients) -> tuple[ja
         return by(_joined(maps), kernel, joined), by_bias
 
     arguments = maps, kernel, gradients
-    return choose(machine_code, lambda *these: native.gradients(*these), by_xla, *arguments)
+    return choose(machine_code, native.gradients, gradients_by_xla, *arguments)
 
 
 _layer.defvjp(_forward, _backward)

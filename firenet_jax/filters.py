@@ -92,20 +92,21 @@ def hot_pixels_of(counts: np.ndarray) -> np.ndarray:
 
 
 def read_hot_pixels(path: str | Path, height: int, width: int) -> np.ndarray:
-    """A text file with one `x,y` per line -> (H, W) bool, the format of rpg_e2vid.
+    """A text file with one `x,y` per line -> (H, W) bool, the format of rpg_e2vid; its first line
+    may be these names.
 
     Raises RecordingError, which names the invalid line.
     """
     path = Path(path)
     hot = np.zeros((height, width), bool)
     for number, line in enumerate(read_lines(path, "list of hot pixels"), 1):
-        if not line.strip():
+        if not line.strip() or number == 1 and "".join(line.lower().split()) == "x,y":
             continue
         try:
             x, y = (int(word) for word in line.split(","))
         except ValueError:
             raise RecordingError(
-                f"{path}, line {number}: expected `x,y`, found {line[:40]!r}"
+                f"{path}, line {number}: expected two whole numbers `x,y`, found {line[:40]!r}"
             ) from None
         if not (0 <= x < width and 0 <= y < height):
             raise RecordingError(

@@ -113,6 +113,7 @@ def display(
     state: DisplayState,
     images: jax.Array,
     valid: jax.Array | None = None,
+    *,
     settings: Display = Display(),
 ) -> tuple[DisplayState, jax.Array]:
     """(DisplayState, (T, B, H, W) float32) -> (DisplayState, (T, B, H, W) uint8).
@@ -185,7 +186,7 @@ def automatic_range(images: jax.Array) -> tuple[jax.Array, jax.Array]:
     return low - margin - BELOW * missing, high + margin + (1 - BELOW) * missing
 
 
-def to_8_bit(images: jax.Array, sigma: float = 0.0) -> jax.Array:
+def to_8_bit(images: jax.Array | np.ndarray, sigma: float = 0.0) -> jax.Array:
     """(..., H, W) float32, clipped to [0, 1] -> the same uint8, after a bilateral filter if sigma
     is not 0."""
     images = jnp.clip(images, 0, 1)

@@ -255,7 +255,10 @@ def reconstruct_at(
     _, before, _, _ = _checked(weights, committed.before, tensors, valid)
     if valid is None:
         valid = jnp.ones(tensors.shape[:2], bool)
-    inputs = weights, Committed(before, last), tensors, steps, valid
+    committed = Committed(before, last)
+    if not recurrent:
+        committed = jax.tree.map(jnp.zeros_like, committed)
+    inputs = weights, committed, tensors, steps, valid
     xla = partial(_by_xla, _scan_at, recurrent, dtype)
     if dtype == jnp.float32:
         return native.choose(partial(_by_machine_code, _scan_at, recurrent), xla, *inputs)
@@ -455,7 +458,7 @@ def events_to_pictures(
             images = images[:, :, top : top + height, left : left + width]
             return Session(state, session.display), images
         # As in the original program, the mask and the intensity range see the padded image.
-        ranges, greys = display(session.display, images, valid, settings)
+        ranges, greys = display(session.display, images, valid, settings=settings)
         greys = greys[:, :, top : top + height, left : left + width]
         return Session(state, ranges), greys
 

@@ -201,11 +201,12 @@ def voxelise(packed: Packed, *, height: int, width: int) -> jax.Array:
 
     def vote(planes, columns):
         t, x, y, p, window = columns
-        # Unused entries index past the end of t_min: the index is clamped, the vote dropped below.
+        # Unused entries index past the end of t_min: JAX clamps the index, and below the vote is
+        # dropped.
         # As unsigned integers, negative coordinates lie outside too.
         window, x, y = (column.astype(jnp.uint32) for column in (window, x, y))
-        since = t - packed.t_min.ravel()[window]  # int32: exact, modulo 2^32
-        t_star = (BINS - 1) * since.astype(jnp.float32) / packed.duration.ravel()[window]
+        since = t - jnp.ravel(packed.t_min)[window]  # int32: exact, modulo 2^32
+        t_star = (BINS - 1) * since.astype(jnp.float32) / jnp.ravel(packed.duration)[window]
         seen = (x < width) & (y < height) & (window < windows)
         pixel = jnp.where(seen, (window * height + y) * width + x, jnp.uint32(2**31))
 

@@ -65,6 +65,8 @@ def test_read_hot_pixels(tmp_path):
     assert np.argwhere(hot).tolist() == [[1, 3], [2, 0]]
     path.write_text("3,1\n0,2\n", "utf-8-sig")  # as Windows writes it
     np.testing.assert_array_equal(filters.read_hot_pixels(path, 4, 5), hot)
+    path.write_text("x, y\n3,1\n0,2\n")
+    np.testing.assert_array_equal(filters.read_hot_pixels(path, 4, 5), hot)
 
 
 @pytest.mark.parametrize("line", ["5,0", "-1,2", "1 2", "1,2,3", "a,b"])

@@ -334,11 +334,12 @@ def test_recordings_side_by_side_and_steps_that_are_not_there(weights):
 def test_steps_that_are_all_kept_are_those_of_reconstruct(weights):
     tensors = np.random.default_rng(2).normal(size=(4, 1, HEIGHT, WIDTH, 5)).astype(np.float32)
     zero = initial_state(1, HEIGHT, WIDTH)
-    for recurrent in (True, False):
-        state, wanted = reconstruct(weights, zero, tensors, recurrent=recurrent)
+    other = reconstruct(weights, zero, tensors)[0]
+    for recurrent, begun in ((True, zero), (False, other)):
+        state, wanted = reconstruct(weights, begun, tensors, recurrent=recurrent)
         kept = Looks(np.zeros((4, 1), bool), np.ones((4, 1), np.float32))
         after, images = reconstruct_at(
-            weights, Committed(zero, zero), tensors, kept, recurrent=recurrent
+            weights, Committed(begun, begun), tensors, kept, recurrent=recurrent
         )
         np.testing.assert_allclose(images, wanted, atol=1e-6)
         np.testing.assert_allclose(after.last.g2, state.g2, atol=1e-6)

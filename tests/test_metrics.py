@@ -1,3 +1,4 @@
+import itertools
 from functools import cache, partial
 
 import jax
@@ -403,6 +404,28 @@ def test_event_correlation_equals_least_squares_block_by_block():
     np.testing.assert_allclose(actual, (fit / total) ** 0.5, rtol=1e-3)
     faint = metrics.event_correlation(np.stack([image] * 2), 1e-3 * np.stack([votes, -votes]))
     np.testing.assert_allclose(faint, (fit / total) ** 0.5, rtol=1e-3)
+
+
+@pytest.mark.parametrize("angle", [0.3, 0.9, 2.2])
+def test_event_correlation_before_straight_edges(angle):
+    """All slopes of a block have one direction, the best velocity is hardly determined, and what
+    it explains is."""
+    y, x = np.mgrid[:56, :70]
+    across = np.cos(angle) * x + np.sin(angle) * y
+    image, votes = 0.5 + 0.4 * np.sin(across / 3), np.cos(across / 3)
+    found = metrics.event_correlation(np.float32(image), np.float32(votes))
+    smooth, events = (gaussian_filter(a, 0.7, radius=3) for a in (image, votes))
+    slopes = np.pad(smooth, 1, "edge")
+    slopes = np.stack([slopes[2:, 1:-1] - slopes[:-2, 1:-1], slopes[1:-1, 2:] - slopes[1:-1, :-2]])
+    fit = 0.0
+    for top, left in itertools.product(range(0, 56, 14), range(0, 70, 14)):
+        block = np.s_[top : top + 14, left : left + 14]
+        matrix = slopes[:, *block].reshape(2, -1).T / 2
+        normal = matrix.T @ matrix
+        normal += np.eye(2) * (1e-6 * np.trace(normal) + 1e-9)
+        by_votes = matrix.T @ events[block].ravel()
+        fit += by_votes @ np.linalg.solve(normal, by_votes)
+    assert float(found) == pytest.approx((fit / (events**2).sum()) ** 0.5, abs=2e-5)
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -42,7 +42,7 @@ def test_what_is_not_said_is_as_the_settings_say():
     assert len({Display(), Display(), Display(0)}) == 2  # arguments of a compiled function
     images = jnp.asarray(np.random.default_rng(5).random((3, 1, 12, 14)), jnp.float32)
     state = initial_display_state(1)
-    shown = [display(state, images, *more)[1] for more in ((), (None, Display(0.3, "auto")))]
+    shown = [display(state, images, **more)[1] for more in ({}, {"settings": Display(0.3, "auto")})]
     np.testing.assert_array_equal(*shown)
     np.testing.assert_array_equal(bilateral(images[0]), bilateral(images[0], 25.0))
 

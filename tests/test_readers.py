@@ -2141,6 +2141,49 @@ def test_columns_in_another_order_are_asked_for(tmp_path, order, seconds):
         open_recording(path, columns="x,y")
 
 
+def test_an_order_that_is_told_beside_a_line_of_names(tmp_path):
+    """The line's unit stays; an order or a unit that contradicts it is refused."""
+    rows = "".join(f"{1500 + 1000 * i},{i},{i + 1},1\n" for i in range(20))
+    path = write(tmp_path / "a.csv", f"t [ns],x,y,p\n{rows}")
+    for columns in (None, "t,x,y,p", "t_ns,x,y,p"):
+        events = concatenate(list(open_recording(path, (240, 320), columns=columns).events()))
+        np.testing.assert_array_equal(events.t, 1 + np.arange(20))
+    told = "line 1: 't [ns],x,y,p', but columns are told to be {!r}: leave out --columns"
+    for columns in ("t,y,x,p", "t_us,x,y,p"):
+        with pytest.raises(RecordingError, match=re.escape(told.format(columns))):
+            open_recording(path, (240, 320), columns=columns)
+
+
+@pytest.mark.parametrize("kind", ["npz", "structured"])
+def test_columns_with_names_have_no_order(tmp_path, kind):
+    if kind == "npz":
+        path = tmp_path / "a.npz"
+        np.savez(path, t=T, x=X, y=Y, p=P)
+    else:
+        path = tmp_path / "a.npy"
+        np.save(path, np.rec.fromarrays([T, X, Y, P], names="t,x,y,p"))
+    with pytest.raises(RecordingError, match="have names, and so no order: leave out --columns"):
+        open_recording(path, (240, 320), columns="x,y,t,p")
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_other_arrays_in_an_npz_may_hold_anything(tmp_path, named):
+    events = {"t": T, "x": X, "y": Y, "p": P} if named else {"events": np.stack([T, X, Y, P], 1)}
+    path = tmp_path / "a.npz"
+    np.savez(path, **events, about=np.array({"a": 1}, object), K=np.eye(3))
+    check(path)
+
+
+def test_text_with_tabs_between_columns(tmp_path):
+    text = "t\tx\ty\tp\n0.1\t1\t2\t1\n0.2\t3\t4\t0\n"
+    for path in (write(tmp_path / "a.tsv", text), tmp_path / "a.tsv.gz"):
+        if path.suffix == ".gz":
+            path.write_bytes(gzip.compress(text.encode()))
+        events = concatenate(list(open_recording(path, (240, 320)).events()))
+        assert events.t.tolist() == [100_000, 200_000] and events.y.tolist() == [2, 4]
+    refused(write(tmp_path / "a.csv", "t;x;y;p\n1;2;3;1\n"), "not apart by spaces, tabs or commas")
+
+
 def test_which_recordings_say_that_they_are_grey(recordings):
     for name, grey in (("davis346_frames.aedat4", True), ("dvxplorer_face.aedat4", True),
                        ("ncars.dat", True), ("ecd_slider_depth", False)):  # fmt: skip

@@ -191,6 +191,13 @@ def test_float32_where_a_program_has_long_floats():
     np.testing.assert_array_equal(found, expected)
 
 
+def test_without_programs():
+    events = random_events(np.random.default_rng(3), 200)
+    expected = tensor_of(events)
+    with jax.disable_jit():
+        np.testing.assert_allclose(tensor_of(events), expected, atol=1e-6)
+
+
 def test_capacities_only_grow_and_are_few():
     assert capacity(1) == CAPACITIES[0]
     assert capacity(CAPACITIES[1] + 1) == CAPACITIES[2]

@@ -29,12 +29,13 @@ from firenet_jax.commands import options
 from firenet_jax.commands.times import Times, read_times, times_of
 from firenet_jax.errors import OutputError, RecordingError, SettingsError, logger
 from firenet_jax.evaluation import lpips, report
-from firenet_jax.evaluation.comparison import Gap, Plan, matched, to_8_bit
+from firenet_jax.evaluation.comparison import Gap, Plan, matched
 from firenet_jax.evaluation.equalise import Kind, equalise
 from firenet_jax.evaluation.methods import METHODS, Method, Missing, load
 from firenet_jax.evaluation.protocol import Protocol, evaluate, plan, steps_of, until
 from firenet_jax.evaluation.results import METRICS, Measured, mean, summary
 from firenet_jax.events import Recording
+from firenet_jax.pictures import to_8_bit
 from firenet_jax.readers import aedat, is_recording, open_recording
 from firenet_jax.settings import check_none_idle, parse_size
 from firenet_jax.storage.files import identity, named, read_arrays, write_arrays, write_text
@@ -439,7 +440,7 @@ def show(settings: Evaluate, plan: Plan, done: list) -> report.Shown:
     @functools.cache
     def truth(number: int) -> np.ndarray:
         frame = plan.frames.read(number).astype(np.float32) / 255
-        return to_8_bit(equalise(frame, settings.equalise))
+        return np.asarray(to_8_bit(equalise(frame, settings.equalise)))
 
     def side_by_side(kind: str) -> Iterator[tuple[int, list[np.ndarray]]]:
         """Frames that every method has: (number, [events, frame, method, method ...])."""

@@ -16,6 +16,7 @@ from firenet_jax.evaluation.equalise import Kind, equalise
 from firenet_jax.evaluation.results import METRICS, Measured
 from firenet_jax.events import Frames, Recording
 from firenet_jax.instants import Grid
+from firenet_jax.pictures import to_8_bit
 from firenet_jax.windows import Windows
 
 IMAGES_AT_ONCE = 8  # that are compared in one call
@@ -212,7 +213,7 @@ class Pictures:
 
     def add(self, batch: list[Comparison], compared: tuple[np.ndarray, np.ndarray]) -> None:
         for entry, image in zip(batch, compared[0], strict=True):
-            picture = int(self.numbers[entry.place]), to_8_bit(image)
+            picture = int(self.numbers[entry.place]), np.asarray(to_8_bit(image))
             if self.wanted and entry.place >= self.wanted[0]:
                 self.wanted = [place for place in self.wanted if place > entry.place]
                 self.kept["stills"].append(picture)
@@ -225,7 +226,3 @@ class Pictures:
             arrays[f"{name}_frames"] = np.array([number for number, _ in kept], np.int64)
             arrays[name] = np.array([picture for _, picture in kept], np.uint8)
         return arrays
-
-
-def to_8_bit(image: np.ndarray) -> np.ndarray:
-    return np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)

@@ -224,7 +224,7 @@ def ms_ssim(image: jax.Array, truth: jax.Array) -> jax.Array:
     scales = ms_ssim_scales(*image.shape[-2:])
     _check_sides(image, WINDOW, "MS-SSIM needs")
     weights = np.array(SCALES[:scales]) / sum(SCALES[:scales])
-    product = jnp.ones(image.shape[:-2])
+    product = jnp.ones(image.shape[:-2], jnp.float32)
     for scale, weight in enumerate(weights.tolist()):
         luminance, cs = _ssim_factors(image, truth, 1.5, 1.0)
         last = scale == scales - 1
@@ -602,15 +602,23 @@ def event_correlation(image: jax.Array, votes: jax.Array) -> jax.Array:
         _filter(image, *weights, "edge") for weights in ((difference, (1,)), ((1,), difference))
     )
 
+    down, across, votes = (
+        values[..., : rows * PATCH, : columns * PATCH] for values in (down, across, votes)
+    )
+
     def summed(values):
-        whole = values[..., : rows * PATCH, : columns * PATCH]
-        return whole.reshape(*values.shape[:-2], rows, PATCH, columns, PATCH).sum((-3, -1))
+        return values.reshape(*values.shape[:-2], rows, PATCH, columns, PATCH).sum((-3, -1))
 
     # The normal equations of two unknowns; a little is added so that a flat block has a solution.
+    # By what of `across` is at right angles to `down`, not by their determinant: before a straight
+    # edge that is all but zero, and float32 would lose three digits.
     least = 1e-6 * summed(down**2 + across**2) + 1e-9  # the gradient divides by its fourth power
-    a, b, c = summed(down**2) + least, summed(down * across), summed(across**2) + least
-    p, q = summed(down * votes), summed(across * votes)
-    fit = (c * p**2 - 2 * b * p * q + a * q**2) / (a * c - b**2)
+    a = summed(down**2) + least
+    share = summed(down * across) / a
+    blocks = jnp.repeat(jnp.repeat(share, PATCH, -2), PATCH, -1)
+    rest = across - blocks * down
+    c = summed(rest**2) + least * (1 + share**2)
+    fit = summed(down * votes) ** 2 / a + summed(rest * votes) ** 2 / c
     total = summed(votes**2).sum((-2, -1))
     part = fit.sum((-2, -1)) / jnp.where(total > 0, total, 1.0)
     return root(jnp.clip(part, 0.0, 1.0))

@@ -142,7 +142,7 @@ def _source(path: Path, sensor_size: tuple[int, int] | None, columns: str | None
         return module.read(path, **options)
     inside = f" (if the folder holds some, name them: {path}/*)" if path.is_dir() else ""
     raise RecordingError(
-        f"{path}: not a recording of a known format: expected text (.txt, .csv) or zip, "
+        f"{path}: not a recording of a known format: expected text (.txt, .csv, .tsv) or zip, "
         "an ECD or EVREAL folder, HDF5, .npy, .npz, N-Caltech101 .bin, .dat, .raw, .aedat, "
         f".aedat4, .es, or a ROS bag{inside}"
     )

@@ -113,15 +113,14 @@ def _of_one_file(path: Path, order: list[str] | None) -> list[np.ndarray]:
             if sum(info.file_size for info in archive.infolist()) > NPZ:
                 raise ValueError(f"claims more than {NPZ >> 30} GB")
         with reading(path, Exception), np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files if name not in SIDES}
-        if len(arrays) == 1:
-            (array,) = arrays.values()
-        else:
-            return _named(path, arrays)
+            arrays = {name: file[name] for name in _wanted(file.files)}
+        if len(arrays) != 1:
+            return _named(path, arrays, order)
+        (array,) = arrays.values()
     else:
         array = _mapped(path)
     if array.dtype.names is not None and array.ndim == 1:
-        return _named(path, {name: array[name] for name in array.dtype.names})
+        return _named(path, {name: array[name] for name in array.dtype.names}, order)
     if array.ndim != 2 or array.shape[1] != 4 or array.dtype.kind not in "iuf":
         raise RecordingError(
             f"{path}: holds {array.dtype} of shape {array.shape}, expected rows (N, 4) of t, x, y, "
@@ -151,11 +150,23 @@ def _sides(path: Path) -> tuple[int, int] | None:
     return height, width
 
 
-def _named(path: Path, arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
+def _wanted(names: list[str]) -> list[str]:
+    """Of the arrays in an .npz those that events are read from; others may hold anything."""
+    columns = [[name for name in known if name in names] for known in text.NAMES.values()]
+    if all(columns):
+        return [found[0] for found in columns]
+    return ["events"] if "events" in names else [name for name in names if name not in SIDES]
+
+
+def _named(path: Path, arrays: dict[str, np.ndarray], order: list[str] | None) -> list[np.ndarray]:
     named = [[arrays[n] for n in names if n in arrays] for names in text.NAMES.values()]
     if not all(named):
         raise RecordingError(
             f"{path}: holds {', '.join(map(repr, arrays)) or 'nothing'}, expected t, x, y and p"
+        )
+    if order is not None:
+        raise RecordingError(
+            f"{path}: its columns have names, and so no order: leave out --columns"
         )
     found = [columns[0] for columns in named]
     if len({column.shape for column in found}) != 1 or found[0].ndim != 1:

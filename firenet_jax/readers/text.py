@@ -1,4 +1,5 @@
-"""Text -> Source: one event a line, `t x y p`, in .txt, .csv, .txt.gz, or a .zip with one of them.
+"""Text -> Source: one event a line, `t x y p`, in .txt, .csv, .tsv, each also as .gz, or a .zip
+with one of them.
 
     240 180                  the sensor's width and height: E2VID and FireNet; none in ECD
     0.003811000 96 133 0     seconds, column, row, polarity 0 or 1 (or -1 or 1, False or True)
@@ -37,6 +38,7 @@ from firenet_jax.storage.files import check_unpacking
 BLOCK = 1 << 21  # bytes parsed at once: about 90,000 events
 PIECE = 1 << 16  # bytes asked for at once: what a zip has unpacked of them is lost at damage
 HEAD = 1 << 16  # bytes from which the layout is inferred
+SUFFIXES = ".txt", ".csv", ".tsv"
 SNIFFED = 1000  # rows from which units and the order of columns are inferred
 BROKEN = zipfile.BadZipFile, zlib.error, EOFError, OSError  # what damaged compressed bytes raise
 
@@ -52,6 +54,7 @@ UNITS = {  # microseconds in a unit: its names
     1.0: ("us", "usec", "µs", "μs", "microsecond", "microseconds"),
     1e-3: ("ns", "nsec", "nanosecond", "nanoseconds"),
 }
+Named = tuple[tuple[str, ...], float | None]  # columns and unit, as in `Layout`
 LOGICAL = ("False", "FALSE", "false", "True", "TRUE", "true")  # and 0 and 1: pyarrow's
 SIDE = re.compile(r"\d{1,9}", re.ASCII)
 WORDS = "no one two three four five six seven eight nine ten".split()
@@ -76,7 +79,7 @@ class Layout(NamedTuple):
 
 def matches(path: Path) -> bool:
     name = path.name.lower()
-    return path.is_file() and name.endswith((".txt", ".csv", ".zip", ".txt.gz", ".csv.gz"))
+    return path.is_file() and name.removesuffix(".gz").endswith((*SUFFIXES, ".zip"))
 
 
 def read(path: Path, member: str | None = None, columns: str | None = None) -> Source:
@@ -119,7 +122,7 @@ def members(path: Path) -> list[str]:
 
 def _only_text(path: Path) -> str:
     names = members(path)
-    texts = [name for name in names if name.lower().endswith((".txt", ".csv"))]
+    texts = [name for name in names if name.lower().endswith(SUFFIXES)]
     texts = texts or names[:1] * (len(names) == 1)  # a single file may have any name
     if len(texts) != 1:
         found = ", ".join(texts[:4]) + (", ..." if len(texts) > 4 else "")
@@ -146,8 +149,9 @@ def _sniff(path: Path, member: str | None, columns: str | None = None) -> Layout
             size = int(match[2]), int(match[1])
             names, told = (names if columns else ("x", "y", "p", "t")), True
         elif named := _names(line.lower().lstrip("#% ")):
-            names, unit = (names, unit) if columns else named
-            told = True
+            if columns is not None:
+                named = _agreed(f"{path}, line {number}: {_shown(line)}", columns, named)
+            (names, unit), told = named, True
         elif not line or line.startswith(("#", "%")):
             continue
         elif size is None and len(words) == 2 and all(map(SIDE.fullmatch, words)):
@@ -155,7 +159,7 @@ def _sniff(path: Path, member: str | None, columns: str | None = None) -> Layout
         elif not (_is_number(words[0]) or names[0] == "p" and words[0] in LOGICAL):
             raise RecordingError(
                 f"{path}, line {number}: {_shown(line)} where numbers, or the names of columns "
-                "t, x, y and p, are expected: it is not a text of events"
+                f"t, x, y and p, are expected: it is not a text of events{_apart(line)}"
             )
         else:
             skip = number - 1
@@ -190,7 +194,26 @@ def _sniff(path: Path, member: str | None, columns: str | None = None) -> Layout
     return Layout(skip, size, names, separator, types, unit)
 
 
-def _names(line: str) -> tuple[tuple[str, ...], float | None] | None:
+def _agreed(line: str, columns: str, named: Named) -> Named:
+    """The names of a line, and its unit or, if it tells none, that of `columns`.
+
+    Raises RecordingError where the two put a column in another place, or differ in the unit.
+    """
+    told = _names(columns.lower()) or named
+    places, others = ([names.index(key) for key in NAMES] for names, _ in (named, told))
+    units = {unit for _, unit in (named, told)} - {None}
+    if places != others or len(units) > 1:
+        raise RecordingError(
+            f"{line}, but columns are told to be {columns!r}: leave out --columns, or this line"
+        )
+    return named[0], units.pop() if units else None
+
+
+def _apart(line: str) -> str:
+    return ", or its columns are not apart by spaces, tabs or commas" if ";" in line else ""
+
+
+def _names(line: str) -> Named | None:
     """A line of names -> those of `Layout`, and the unit of the times, in microseconds, if told.
 
     None if t, x, y, p are not all among them.

@@ -16,7 +16,12 @@ import jax.numpy as jnp
 
 from firenet_jax.errors import SettingsError
 from firenet_jax.simulation.scenes import Scene, SceneSettings, log_uniform, random_scene
-from firenet_jax.simulation.sensor import Sensor, SensorSettings, random_sensor
+from firenet_jax.simulation.sensor import (
+    LEAST_THRESHOLD,
+    Sensor,
+    SensorSettings,
+    random_sensor,
+)
 from firenet_jax.simulation.sequences import Simulation, simulate
 
 SLOW, SWIFT = (0.02, 0.3), (16.0, 90.0)  # pixels per window, in slow and swift sequences
@@ -142,7 +147,7 @@ def _uneven(sensors: Sensor, kind: jax.Array, is_slow: jax.Array, slow: float) -
 
     def uneven(thresholds):
         mean = thresholds.mean((-2, -1), keepdims=True)
-        return jnp.maximum(mean + apart * (thresholds - mean), 0.01)
+        return jnp.maximum(mean + apart * (thresholds - mean), LEAST_THRESHOLD)
 
     if sensors.on.ndim == 3:  # else all pixels of a sequence have one
         sensors = sensors._replace(on=uneven(sensors.on), off=uneven(sensors.off))

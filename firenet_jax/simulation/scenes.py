@@ -5,8 +5,8 @@ paper, and several textured objects in front of it, each a plane with its own mo
 nearer objects hide farther ones. Nothing is simulated step by step: `render` and `flow` give the
 picture and the exact displacement at any time, so frames can be as dense as a sensor needs.
 
-Times are seconds since the scene's start, float32, which tells microseconds apart for about a
-minute. Images are (H, W) float32 in [0, 1], grey values as they stand in picture files (the
+Times are seconds since the scene's start, float32: its clock ticks in at most 1 us for 16 s, in 4
+us at a minute. Images are (H, W) float32 in [0, 1], grey values as they stand in picture files (the
 published network was trained on these). Lengths in the world are pixels as seen at the rest
 distance of the background. All functions of JAX here are written for one scene; `jax.vmap` makes
 them functions of many. Textures are (N, S, S) float32: `textures.load_textures`.
@@ -530,7 +530,7 @@ def speeds(scene: Scene, t: jax.Array, *, height: int, width: int) -> jax.Array:
         def positions(t):
             return jax.vmap(_project)(_to_image(scene, t, height, width), *points)
 
-        _, (dx, dy) = jax.jvp(positions, (t,), (jnp.ones(()),))
+        _, (dx, dy) = jax.jvp(positions, (t,), (jnp.ones_like(t),))
         fastest = jnp.hypot(dx, dy).max(-1)  # (K + 1,)
         return jnp.where(exists, fastest, 0.0).max()
 

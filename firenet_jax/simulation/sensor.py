@@ -237,6 +237,7 @@ def random_sensor(
 ) -> Sensor:
     """The sensor of a sequence: thresholds and faults, drawn once."""
     shape = height, width
+    # Further keys are `fold_in(key, 5)` and so on: those of less than 5 are these.
     number_key, spread_key, mismatch_key, drift_key, noise_key = jax.random.split(key, 5)
     numbers = iter(jax.random.uniform(number_key, (6,)))
     spread = jax.random.normal(spread_key, (2,))
@@ -265,7 +266,7 @@ def random_sensor(
             drift = jnp.where(chance < share, rate, drift)
     start = None
     if settings.mid_recording:
-        start = jax.random.uniform(jax.random.fold_in(key, 1), shape)
+        start = jax.random.uniform(jax.random.fold_in(key, 5), shape)
     if settings.refractory_range is not None:
         refractory = log_uniform(settings.refractory_range, next(numbers))
     else:
@@ -276,15 +277,15 @@ def random_sensor(
         noise = jnp.stack([log_uniform(settings.noise, next(numbers)), NOISE_IN_LIGHT, 0.0])
         if settings.noise_in_light is not None:
             low, high = map(math.log, settings.noise_in_light)
-            slope = jax.random.uniform(jax.random.fold_in(key, 4), minval=low, maxval=high)
+            slope = jax.random.uniform(jax.random.fold_in(key, 8), minval=low, maxval=high)
     if _on(settings.cutoff):
         cutoff = jnp.stack([log_uniform(settings.cutoff, next(numbers)), settings.cutoff_dark])
     refractory = jnp.round(refractory * 1e6 * TICKS).astype(jnp.int32) if silenced else None
-    lamp = _lamp(jax.random.fold_in(key, 3), shape, settings.flicker)
+    lamp = _lamp(jax.random.fold_in(key, 7), shape, settings.flicker)
     sensor = Sensor(on, off, refractory, drift, noise, slope, cutoff, phase, start, lamp, noise_key)
     if not settings.clean:
         return sensor
-    clean_key, plain_key = jax.random.split(jax.random.fold_in(key, 2))
+    clean_key, plain_key = jax.random.split(jax.random.fold_in(key, 6))
     clean = jax.random.uniform(clean_key) < settings.clean
     return _without_faults(sensor, clean, jax.random.normal(plain_key, (2,)))
 

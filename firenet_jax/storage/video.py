@@ -40,7 +40,7 @@ WHOLE = (*VIDEOS, ".h5", ".bag", ".ros2")  # made in one go; all else is a folde
 OTHER_FILES = (
     ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".png", ".apng", ".jpg",
     ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".npy", ".npz", ".h5", ".hdf5", ".zip", ".gz",
-    ".txt", ".csv", ".json", ".raw", ".dat", ".bin", ".es", ".aedat", ".aedat4",
+    ".txt", ".csv", ".tsv", ".json", ".raw", ".dat", ".bin", ".es", ".aedat", ".aedat4",
     ".bag", ".db3", ".mcap",
 )  # fmt: skip
 LIKE_A_FILE = re.compile(r"\.[A-Za-z][A-Za-z0-9]{2,4}")  # nor is any other such ending

@@ -275,7 +275,7 @@ def _sharded(data: Simulation) -> Simulation:
 
 
 def _check_finite(terms: dict[str, float], state: TrainState, folder: Path) -> None:
-    if not np.isfinite(terms["loss"]) and int(state.optimiser.notfinite_count) >= 10:
+    if int(state.optimiser.notfinite_count) >= 10:
         raise FirenetError(
             f"{folder}: ten steps in a row had no finite gradient, training has diverged: start "
             "again with a smaller --learning-rate"

@@ -100,7 +100,7 @@ def optimiser(settings: StepSettings) -> optax.GradientTransformation:
     update = optax.chain(optax.clip_by_global_norm(settings.clip), update)
     if settings.optimiser == "centred":
         update = optax.GradientTransformationExtraArgs(*centred(update))
-    return optax.apply_if_finite(update, max_consecutive_errors=10)
+    return optax.apply_if_finite(update, max_consecutive_errors=2**31 - 1)
 
 
 def _as_matrices(params):

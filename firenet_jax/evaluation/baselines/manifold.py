@@ -146,7 +146,8 @@ def advance(
 
 def _contrasts(pixel, p, shape, settings: Manifold) -> jax.Array:
     """The product over each pixel's events: c_on for ON, 1 / c_off for OFF."""
-    logs = jnp.where(p, math.log(settings.contrast_on), -math.log(settings.contrast_off))
+    on, off = np.log([settings.contrast_on, settings.contrast_off], dtype=np.float32)
+    logs = jnp.where(p, on, -off)
     return jnp.exp(jax.ops.segment_sum(logs, pixel, math.prod(shape))).reshape(shape)
 
 
