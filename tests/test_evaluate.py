@@ -13,6 +13,7 @@ import zipfile
 from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import jax
@@ -547,7 +548,12 @@ def test_a_window_up_to_a_frame_is_compared_with_none_before():
 
 
 def test_intervals_of_the_event_camera_dataset(tmp_path):
-    assert CUTS["office_zigzag"] == (5, 12) and CUTS["poster_6dof"] == (5, 20)
+    assert CUTS == {
+        **dict.fromkeys(("boxes_6dof", "calibration", "dynamic_6dof"), (5, 20)),
+        **dict.fromkeys(("poster_6dof", "shapes_6dof"), (5, 20)),
+        "office_zigzag": (5, 12),
+        "slider_depth": (1, 2.5),
+    }
     events = events_of(3000, 3_000_000)
     path = write(tmp_path / "slider_depth.h5", 31, events, period=100_000)
     recording = open_recording(path)
@@ -594,6 +600,23 @@ def test_frames_that_end_at_damage_are_a_gap(folder, tmp_path):
     protocol = settings(folder, tmp_path / "out").protocol
     with pytest.raises(Gap, match="its frames end where it is damaged: a.h5: cut off"):
         plan("a", recording, protocol)
+
+
+def test_frames_that_cannot_be_compared_are_a_gap(folder, tmp_path):
+    whole = open_recording(folder / "data" / "a.h5")
+    protocol = settings(folder, tmp_path / "out").protocol
+
+    def planned(height=HEIGHT, times=whole.frames.times):
+        frames = whole.frames._replace(times=times, read=lambda n: moving_pattern(n)[:height])
+        return plan("a", dataclasses.replace(whole, height=height, frames=frames), protocol)
+
+    assert planned(17).last == 6
+    with pytest.raises(Gap, match="28x16 pixels are too small to be compared"):
+        planned(16)
+    times = whole.frames.times.copy()
+    times[3] = times[2] - 1
+    with pytest.raises(Gap, match="times of frames run backwards"):
+        planned(times=times)
 
 
 def test_a_silent_camera_leaves_the_frames_that_count_as_they_are(folder, tmp_path):
@@ -652,6 +675,11 @@ def test_images_and_frames_are_equalised_before_metrics(folder, tmp_path, kind):
         for _, image, frame in direct(folder, "hf", "a")
     ]
     assert entry["values"]["mse"] == pytest.approx(mse, abs=1e-5)
+    choices["equalise"] = "none"
+    plain = run(settings(folder, tmp_path / "plain", **choices))["sequences"]["a"]["methods"]["hf"]
+    equalised, as_they_are = (found["values"]["temporal_error"] for found in (entry, plain))
+    assert equalised[1:] == pytest.approx(as_they_are[1:], abs=1e-6)  # flicker, not contrast
+    assert equalised[0] is None and min(equalised[1:]) > 0
 
 
 def test_windows_of_events_and_of_time(folder, tmp_path):
@@ -960,6 +988,20 @@ def test_the_best_is_the_least_distance_and_the_greatest_similarity():
     }
     assert _best(entries, "mse") == "0.0100" and _best(entries, "ssim") == "0.900"
     assert _best({"a": entries["a"], "c": entries["c"]}, "mse") is None
+
+
+def test_stills_and_clip_are_of_the_frames_that_count():
+    """Of 100 to 299 at 20, 55 and 90 %, and the 60 in the middle."""
+    numbers = 3 * np.arange(400)
+    kept = comparison.Pictures(SimpleNamespace(first=100, last=300, numbers=numbers))
+    for place in range(100, 300):
+        if place != 210:  # has no image: the next one
+            image = np.full((1, 2, 2), (place - 100) / 255)
+            kept.add([comparison.Comparison(place, None, None, None)], (image, image))
+    found = kept.arrays()
+    assert found["stills_frames"].tolist() == [3 * 140, 3 * 211, 3 * 280]
+    assert found["clip_frames"].tolist() == [3 * n for n in range(170, 231) if n != 210]
+    assert found["stills"][:, 0, 0].tolist() == [40, 111, 180] and len(found["clip"]) == 60
 
 
 def test_what_became_a_gap_leaves_nothing_of_other_settings(folder, tmp_path):

@@ -101,6 +101,15 @@ def test_a_hot_pixel_is_ten_times_as_busy_as_its_neighbours_and_far_from_the_mea
     assert is_hot(quiet, 10) and not is_hot(quiet, 9)
 
 
+@pytest.mark.parametrize("distance, alone", [(2, False), (3, True)])
+def test_a_hot_pixels_neighbours_are_those_up_to_two_away(distance, alone):
+    """A square around it, of which the pixels next to it are no part, is as busy."""
+    counts, (y, x) = np.ones((60, 80), int), np.mgrid[:60, :80]
+    away = np.maximum(abs(y - 10), abs(x - 20))
+    counts[(away == 0) | (away == distance)] = 1000
+    assert filters.hot_pixels_of(counts)[10, 20] == alone
+
+
 def test_hot_pixels_are_found_where_few_others_are_active():
     """What is usual is not taken from the hot ones, however many of the active pixels these are."""
     counts = np.zeros((60, 80), int)

@@ -383,6 +383,17 @@ def test_the_last_events_before_a_pause_do_not_wait_for_its_end():
     assert [len(w.events) for w in cut(parts, 60, 40_000, 0.1)] == [15]
 
 
+def test_what_is_left_of_a_full_window_waits_as_long_as_what_came_with_it():
+    """Not since the window's own beginning."""
+    events, nothing = some_events(80, last=1000), Events.empty()
+    first, rest = events.select(slice(5)), events.select(slice(5, None))
+    parts = [(0.0, first), (0.03, rest), (0.06, nothing), (0.08, nothing)]
+    assert [(len(w.events), w.at) for w in cut(parts, 60, 40_000)] == [(60, 0.03), (20, 0.03)]
+    more = some_events(7, last=1000, start=2000)
+    parts[3:] = [(0.065, more)]  # the pause was not long enough
+    assert [len(w.events) for w in cut(parts, 60, 40_000)] == [60, 27]
+
+
 def test_what_cannot_be_is_left_out_and_counted():
     events = Events.of([5, 6, 4, 7, 8], [0, 20, 1, 2, -1], [0, 0, 0, 12, 3], [1] * 5)
     figures = Figures()
@@ -497,6 +508,20 @@ def test_pictures_are_those_of_the_batch_program(weights):
     summary = figures.summary()
     assert (summary["windows"], summary["dropped_windows"], summary["events"]) == (5, 0, 420)
     assert 0 < summary["latency_ms"] <= summary["latency_95_ms"]
+
+
+def test_windows_are_cut_by_the_limits_of_the_pictures(weights, monkeypatch):
+    seen = []
+
+    def noted(arrivals, count, longest, **choices):
+        seen.append((count, longest, choices))
+        return windows(arrivals, count, longest, **choices)
+
+    monkeypatch.setattr("firenet_jax.live.engine.windows", noted)
+    source = sources.Source("parts", HEIGHT, WIDTH, iter([some_events(84)]))
+    limits = Limits(84, 10**6, 10, speed=0.25)
+    assert len(list(pictures(source, weights, limits, Figures()))) == 1
+    assert seen == [(84, 10**6, {"speed": 0.25})]
 
 
 # ---- The page

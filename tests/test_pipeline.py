@@ -758,6 +758,7 @@ def test_a_second_run_into_a_folder_touches_nothing(tmp_path, weights, monkeypat
     assert (tmp_path / "out.partial.mp4").read_bytes() == b"half"
     run(settings(weights, (recording,), out))
     assert len(list(out.glob("*.png"))) == 30 and not partial.exists()
+    assert {path.suffix for path in out.iterdir()} == {".png", ".txt"}
 
 
 def test_a_short_recording_is_a_video_and_the_closing_line_says_how(tmp_path, weights, capsys):

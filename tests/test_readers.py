@@ -1049,7 +1049,9 @@ def test_dat(tmp_path, monkeypatch):
         other = header.replace(b"% Version 2", told)
         check(write(tmp_path / "b.dat", other + b"\x0c\x08" + body), size=None)
     old = b"".join(struct.pack("<II", t, p << 17 | y << 9 | x) for t, x, y, p in EVENTS)
-    check(write(tmp_path / "old.dat", header.replace(b"ion 2", b"ion 1") + b"\x0c\x08" + old))
+    for told in (b"% Version 1\n", b"% Version 0\n", b""):  # not told: that of the first files
+        other = header.replace(b"% Version 2\n", told)
+        check(write(tmp_path / "old.dat", other + b"\x0c\x08" + old))
     # 32 bits of microseconds start again after 71.6 minutes, within a chunk or between two
     times = [2**32 - 2, 2**32 - 1, 0, 5]
     body = b"".join(struct.pack("<II", t, 0) for t in times)

@@ -51,8 +51,11 @@ def test_folder_goes_on_where_it_stopped(tmp_path):
     writer = FolderWriter(tmp_path / "out")
     writer.keep(3)
     writer.write(pictures[3], 3)
+    for name in ("resume.npz", "resume.4.npz"):
+        (writer.partial / name).write_bytes(b"a position, and one that was not published")
     writer.finish()
-    assert len(list((tmp_path / "out").glob("*.png"))) == 4
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"timestamps.txt", *(f"frame_{k:010d}.png" for k in range(4))}
     stamps = (tmp_path / "out" / "timestamps.txt").read_text().split()
     assert stamps == [f"0.00000{k}" for k in range(4)]
 
@@ -97,23 +100,34 @@ def test_a_finished_folder_is_replaced_whole(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-@pytest.mark.parametrize("suffix, tolerance", [(".mp4", 6), (".gif", 1)])
-@pytest.mark.parametrize("colour", [False, True])
-def test_videos_decode_to_what_was_written(tmp_path, suffix, tolerance, colour):
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+@pytest.mark.parametrize("colour, lost", [(False, 0.9), (True, 2.2)])
+def test_videos_decode_to_what_was_written(tmp_path, suffix, colour, lost):
+    """lost: levels of an mp4, on average 0.6 and in colour 1.7; at half the quality 1.3 and 2.7."""
     pictures = ramp()
     if colour:  # a few flat colours, as in the event pictures
         pictures = [np.stack([p // 64 * 64, p * 0, p * 0 + 200], -1) for p in pictures]
     path = tmp_path / f"video{suffix}"
     write_video(path, pictures, fps=25)
-    frames = decoded(path)
-    assert len(frames) == 6
-    for frame, picture in zip(frames, pictures, strict=True):
-        picture = np.stack([picture] * 3, -1) if picture.ndim == 2 else picture
-        difference = np.abs(frame[:30, :41].astype(int) - picture)
-        assert np.median(difference) <= tolerance
+    written = np.stack([p if colour else np.stack([p] * 3, -1) for p in pictures])
+    if suffix == ".mp4":  # its sides are even: the last column is there twice
+        written = np.pad(written, ((0, 0), (0, 0), (0, 1), (0, 0)), mode="edge")
+    frames = np.stack(decoded(path))
+    assert frames.shape == written.shape
+    difference = np.abs(frames.astype(int) - written)
+    assert difference.mean() < lost if suffix == ".mp4" else difference.max() <= 1
     with av.open(str(path)) as container:
         assert float(container.streams.video[0].average_rate) == pytest.approx(25, rel=0.01)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_what_has_one_colour_has_one_in_a_gif_of_too_many(tmp_path):
+    """It is not dithered: noise would move over what stands still."""
+    colours = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
+    write_video(tmp_path / "a.gif", [colours.repeat(4, 0).repeat(4, 1)])
+    blocks = decoded(tmp_path / "a.gif")[0].reshape(20, 4, 30, 4, 3).astype(int)
+    assert np.ptp(blocks, (1, 3)).max() == 0
+    assert np.abs(blocks[:, 0, :, 0] - colours).mean() < 20
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
@@ -393,18 +407,18 @@ def test_pictures_closer_than_a_gif_can_tell_play_slower(tmp_path):
 
 
 @pytest.mark.parametrize("name, most", [("a.mp4", 2**28 / 90_000), ("a.gif", 655.35)])
-def test_a_pause_longer_than_a_video_can_hold_is_cut(tmp_path, name, most, caplog):
-    """As of a clock that was set to today's time while it recorded."""
-    times = [0, 40_000, *(1_700_000_000_000_000 + np.array([0, 40_000, 100_000]))]
+def test_pauses_longer_than_a_video_can_hold_are_cut(tmp_path, name, most, caplog):
+    """As of a clock that was set to today's time while it recorded, and once more."""
+    today = 1_700_000_000_000_000
+    times = [0, 40_000, today, today + 40_000, 2 * today + 50_000, 2 * today + 110_000]
     writer = open_writer(tmp_path / name)
-    for picture, time in zip(ramp(5), times, strict=True):
+    for picture, time in zip(ramp(6), times, strict=True):
         writer.write(picture, int(time))
     writer.finish()
     with av.open(str(tmp_path / name)) as container:
         shown = [float(frame.pts * frame.time_base) for frame in container.decode(video=0)]
-    np.testing.assert_allclose(
-        shown, np.array([0, 0.04, 0.04, 0.08, 0.14]) + most * (np.arange(5) > 1), atol=1e-3
-    )
+    pauses = np.array([0, 0, 1, 1, 2, 2])
+    np.testing.assert_allclose(shown, [0, 0.04, 0.04, 0.08, 0.08, 0.14] + most * pauses, atol=1e-3)
     assert caplog.text.count("pauses are cut to") == 1
 
 

@@ -177,7 +177,7 @@ def test_windows_are_cut_in_one_way_which_may_be_any():
     assert Windows(events=2**31 - 1).count(6) == 2**31 - 1
     assert times_of(recording, duration=1, step=1) == times_of(recording, duration=1)
     assert times_of(recording, duration=1) == [[0, 1, 2, 999], [1000, 1001]]
-    assert [Windows().count(pixels) for pixels in (1, 3, 4, 100)] == [1, 1, 1, 35]
+    assert [Windows().count(pixels) for pixels in (1, 3, 4, 5, 100)] == [1, 1, 1, 2, 35]
     assert Windows(events_per_pixel=0.5).count(100) == 50
     assert Windows(frame_to_frame=False).longest is None
     for one in ({"events": 5}, {"events_per_pixel": 1.0}, {"duration": 5.0}):
