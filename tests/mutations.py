@@ -208,8 +208,6 @@ _also("simulation/sensor.py", "it is written before it is read", "state, previou
 _also("simulation/sequences.py", "after the last event nothing votes",
       "_, voted = jax.lax.while_loop(lambda carry: carry[0] <= most, several, start)",
       )  # fmt: skip
-_also("simulation/sensor.py", "without noise its slope says nothing",
-      "noise_slope=unless(0.1, sensor.noise_slope),")  # fmt: skip
 _also("simulation/sensor.py", "a bandwidth beyond all that happens",
       "cutoff=unless(jnp.array([1500000000.1, 1.0]), sensor.cutoff),"
       "  # so high that it has no effect")  # fmt: skip

@@ -18,7 +18,7 @@ from firenet_jax.simulation.curricula import (
     window_bounds,
 )
 from firenet_jax.simulation.scenes import SceneSettings
-from firenet_jax.simulation.sensor import FAULTY, Sensor, SensorSettings
+from firenet_jax.simulation.sensor import FAULTY, Noise, Sensor, SensorSettings
 from firenet_jax.simulation.sequences import simulate
 from firenet_jax.simulation.textures import load_textures
 from firenet_jax.training.settings import Train
@@ -79,7 +79,7 @@ def test_rare_sequences_are_slow_and_calm_or_swift_before_a_blank_ground(texture
     np.testing.assert_array_equal(np.ptp(grounds, axis=1) == 0, swift)
     assert len(scenes.textures) == 2 and (np.ptp(scenes.textures[1], (1, 2)) > 0.05).all()
     assert 0.2 <= grounds[swift].min() < 0.3 and 0.7 < grounds[swift].max() <= 0.8
-    calm = np.asarray(sensors.noise[:, 0]) < 0.5
+    calm = np.asarray(sensors.noise.rate) < 0.5
     assert not calm[~slow].any() and 0.4 < calm[slow].mean() < 0.9
     even, _, _ = made(slow=1e-9, swift=0.2)
     for name in ("on", "off"):
@@ -164,9 +164,9 @@ def test_slow_sequences_have_four_times_the_mismatch_and_two_thirds_hardly_any_n
     rng, kind = np.random.default_rng(0), np.array([0.0, 0.19, 0.21, 0.29, 0.31, 0.9])
     is_slow, slow = kind < 0.3, 0.3
     on, off = 0.1 + 0.04 * rng.standard_normal((2, 6, 5, 7))
-    noise, drift = rng.random((6, 3)), rng.random((6, 5, 7))
+    drift, noise = rng.random((6, 5, 7)), Noise(*rng.random((4, 6)))
     fields = {"on": on, "off": off, "noise": noise, "drift": drift}
-    sensors = sensors_of(6, **{name: jax.numpy.float32(value) for name, value in fields.items()})
+    sensors = sensors_of(6, **jax.tree.map(jax.numpy.float32, fields))
     found = curricula._uneven(sensors, kind, is_slow, slow)
     share = np.array([0.02, 0.02, 1, 1, 1, 1])
     for name, before in (("on", on), ("off", off)):
@@ -175,8 +175,8 @@ def test_slow_sequences_have_four_times_the_mismatch_and_two_thirds_hardly_any_n
         np.testing.assert_allclose(
             getattr(found, name), np.maximum(mean + apart, 0.01), rtol=1e-4, atol=1e-6
         )
-    expected = noise * np.stack([share, np.ones(6), np.ones(6)], -1)
-    np.testing.assert_allclose(found.noise, expected, rtol=1e-5)
+    expected = noise._replace(rate=share * noise.rate)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-5), found.noise, expected)
     np.testing.assert_allclose(found.drift, drift * share[:, None, None], rtol=1e-5)
     bare = sensors_of(6)  # one threshold for all pixels, no noise, no leaks
     assert curricula._uneven(bare, kind, is_slow, slow) == bare
@@ -185,30 +185,30 @@ def test_slow_sequences_have_four_times_the_mismatch_and_two_thirds_hardly_any_n
 @pytest.mark.parametrize("slope", [None, -1.5])
 def test_half_of_the_sequences_at_rest_are_noisy_and_half_of_these_by_chance(slope):
     batch, windows = 4000, 6
-    noise = np.tile(np.float32([0.5, 0.25, 0.0]), (batch, 1))
     slopes = None if slope is None else np.full(batch, slope, np.float32)
-    sensors = sensors_of(batch, noise=noise, noise_slope=slopes)
+    rates, lights = (np.full(batch, value, np.float32) for value in (0.5, 0.25))
+    sensors = sensors_of(batch, noise=Noise(rates, lights, slopes, np.zeros(batch, bool)))
     duration = np.where(np.arange(batch) % 2, 10_000, 40_000).astype(np.int32)
     lasts = np.arange(batch) % 3 > 0  # as long as all windows and a bit, or nearly as long
     stop = 1e-6 * windows * duration * np.where(lasts, 1.001, 0.999)
     pauses = np.stack([np.full(batch, 0.3), 0.3 + stop], -1)[:, None]
     arguments = sensors, SimpleNamespace(pauses=pauses), windows, duration
     found = curricula._noisy_at_rest(jax.random.key(0), *arguments)
-    rate, light, drawn = np.asarray(found.noise).T
+    rate, light, slopes, drawn = map(np.asarray, found.noise)
     noisy = light == 1
     assert not noisy[~lasts].any() and abs(noisy[lasts].mean() - 0.5) < 0.03
-    np.testing.assert_array_equal(np.asarray(found.noise)[~noisy], noise[~noisy])
-    assert set(drawn) == {0, 1} and abs(drawn[noisy].mean() - 0.5) < 0.04
+    assert (rate[~noisy] == 0.5).all() and (light[~noisy] == 0.25).all()
+    assert not drawn[~noisy].any() and abs(drawn[noisy].mean() - 0.5) < 0.04
     share = np.log(rate * 1e-6 * duration / 0.02)[noisy] / np.log(50)  # 0.02 to 1 in a window
     assert -0.001 < share.min() < 0.01 and 0.99 < share.max() < 1.001
     assert abs(share.mean() - 0.5) < 0.03
     assert abs(np.corrcoef(share, drawn[noisy])[0, 1]) < 0.07
     if slope is None:
-        assert found.noise_slope is None
+        assert found.noise.slope is None
     else:
-        equal = np.asarray(found.noise_slope) == 0
+        equal = slopes == 0
         assert not equal[~noisy].any() and abs(equal[noisy].mean() - 0.4) < 0.04
-        assert (np.asarray(found.noise_slope)[~equal] == slope).all()
+        assert (slopes[~equal] == slope).all()
         assert abs(np.corrcoef(equal[noisy], drawn[noisy])[0, 1]) < 0.07
     quiet = sensors_of(batch)
     assert curricula._noisy_at_rest(jax.random.key(0), quiet, *arguments[1:]) is quiet
@@ -248,16 +248,15 @@ def test_half_of_the_sequences_that_stop_for_good_are_noisy_in_any_light(texture
     sensors, scenes, durations = make(jax.random.key(4), textures)
     seconds = 1e-6 * np.asarray(durations)
     stopped = np.diff(scenes.pauses[:, 0, :2])[:, 0] > T * seconds
-    rate, light, drawn = np.asarray(sensors.noise).T
+    rate, light, _, drawn = map(np.asarray, sensors.noise)
     noisy = light == 1
     assert 0.35 < stopped.mean() < 0.65 and not noisy[~stopped].any()
     assert 0.3 < noisy[stopped].mean() < 0.7
     in_a_window = (rate * seconds)[noisy]
     assert (in_a_window > 0.0199).all() and (in_a_window < 1.001).all()
     assert not drawn[~noisy].any() and 0.3 < drawn[noisy].mean() < 0.7
-    usual = sensors.noise[~noisy]
-    np.testing.assert_array_equal(usual[:, 1], 0.25)
-    assert (usual[:, 0] <= FAULTY.noise[1]).all()
+    np.testing.assert_array_equal(light[~noisy], 0.25)
+    assert (rate[~noisy] <= FAULTY.noise[1]).all()
 
 
 @pytest.mark.slow
@@ -267,7 +266,7 @@ def test_of_sensors_whose_noise_shows_the_dark_fewer_are_equally_noisy_at_rest(t
     settings["scene"] = replace(SETTINGS["scene"], halt=1.0)
     make = jax.jit(partial(random_setups, **settings))
     sensors, _, _ = make(jax.random.key(4), textures)
-    noisy = np.asarray(sensors.noise)[:, 1] == 1
-    equal = np.asarray(sensors.noise_slope) == 0
+    noisy = np.asarray(sensors.noise.light) == 1
+    equal = np.asarray(sensors.noise.slope) == 0
     assert 0.1 < equal.mean() < 0.3 and noisy[equal].all()  # 0.4 of a half
     assert 0.2 < (noisy & ~equal).mean() < 0.4

@@ -1,5 +1,6 @@
 from dataclasses import replace
 from functools import partial
+from operator import attrgetter
 from types import SimpleNamespace
 
 import jax
@@ -22,6 +23,7 @@ from firenet_jax.simulation.sensor import (
     FLICKER_INTERVAL,
     MAX_INTERVAL,
     TICKS,
+    Noise,
     Sensor,
     SensorSettings,
     check_idle,
@@ -46,13 +48,16 @@ def plain_sensor(on=0.2, off=0.17, refractory=0.0):
         refractory=jnp.int32(refractory * 1e6 * 1024) if refractory else None,
         drift=None,
         noise=None,
-        noise_slope=None,
         cutoff=None,
         phase=None,
         start=None,
         lamp=None,
         key=jax.random.key(0),
     )
+
+
+def shot_noise(rate, light, random=False):
+    return Noise(jnp.float32(rate), jnp.float32(light), None, jnp.bool_(random))
 
 
 def listed(sensor, times, logs):
@@ -451,8 +456,8 @@ def numbers_of(drawn):
     return {
         "on": (log(drawn.on), log(0.1), log(0.4)),
         "refractory": (log(drawn.refractory / (1e6 * TICKS)), log(1e-4), log(1e-2)),
-        "noise": (log(drawn.noise[:, 0]), log(0.1), log(10.0)),
-        "light": (drawn.noise_slope, log(0.01), log(0.5)),
+        "noise": (log(drawn.noise.rate), log(0.1), log(10.0)),
+        "light": (drawn.noise.slope, log(0.01), log(0.5)),
         "leak": (log(drawn.drift[:, 0, 0] / drawn.on), log(0.01), log(0.5)),
         "cutoff": (log(drawn.cutoff[:, 0]), log(100.0), log(1000.0)),
         "hertz": (log(lamp.hertz), log(60.0), log(240.0)),
@@ -489,7 +494,7 @@ def test_drifting_pixels_begin_anywhere_and_half_of_all_with_a_noise_event_on():
     """Where L rises they are above the reference, where it sinks below, and the others on it."""
     shape, phase = (200, 200), jax.random.uniform(jax.random.key(2), (200, 200))
     drift = jnp.broadcast_to(jnp.array([1.0, -1.0, 0.0, 2.0])[None].repeat(50, 1), shape)
-    sensor = plain_sensor()._replace(drift=drift, phase=phase, noise=jnp.array([1.0, 0.25, 0.0]))
+    sensor = plain_sensor()._replace(drift=drift, phase=phase, noise=shot_noise(1.0, 0.25))
     state = module.first_state(sensor, jnp.full(shape, 0.5))
     expected = np.select([drift > 0, drift < 0], [0.2 * phase, -0.17 * phase], 0)
     np.testing.assert_allclose(state.above, expected, atol=1e-6)
@@ -511,7 +516,7 @@ def test_leaks_are_on_events_at_their_rate_and_not_all_at_once():
 
 def noisy_sensor(rate, on=0.2, off=0.17):
     phase = jax.random.uniform(jax.random.key(1), (H, W))
-    return plain_sensor(on, off)._replace(noise=jnp.array([rate, 0.25, 0.0]), phase=phase)
+    return plain_sensor(on, off)._replace(noise=shot_noise(rate, 0.25), phase=phase)
 
 
 def test_shot_noise_has_its_rate_and_no_order():
@@ -546,7 +551,7 @@ def test_renderings_between_are_on_the_line_of_log_intensity():
     rng = np.random.default_rng(3)
     images = rng.uniform(0.1, 1, (3, H, W)).astype(np.float32)
     times = np.array([0, 400_000, 800_000])
-    noisy = noisy_sensor(0.0)._replace(noise=jnp.array([20.0, 0.25, 0.0]))
+    noisy = noisy_sensor(0.0)._replace(noise=shot_noise(20.0, 0.25))
     dense = list(module._dense(noisy, zip(times, images, strict=True)))
     assert len(dense) == 1 + 2 * 16 and [t for t, _ in dense[::16]] == times.tolist()
     logs = np.log(EPS + np.stack([image for _, image in dense]))
@@ -584,7 +589,7 @@ def test_noise_in_light_is_drawn_from_its_range():
     settings = replace(FAULTY, noise_in_light=(0.01, 0.5))
     draw = partial(module.random_sensor, height=4, width=4, settings=settings)
     sensors = jax.vmap(draw)(jax.random.split(jax.random.key(3), 400))
-    logs, rates = np.asarray(sensors.noise_slope), np.asarray(sensors.noise)[:, 0]
+    logs, rates = np.asarray(sensors.noise.slope), np.asarray(sensors.noise.rate)
     assert logs.min() >= np.log(0.0099) and logs.max() <= np.log(0.501)
     assert abs(logs.mean() - np.log(0.01 * 0.5) / 2) < 0.2
     assert abs(np.corrcoef(logs, np.log(rates))[0, 1]) < 0.2  # of each other's number
@@ -892,7 +897,7 @@ def test_noise_of_drawn_signs_adds_up_and_alternating_noise_does_not():
     grey = jnp.full((50, 60), 0.5)
     settings = replace(module.SensorSettings(), noise=(300.0, 300.0))
     alternating = module.random_sensor(jax.random.key(1), height=50, width=60, settings=settings)
-    drawn = alternating._replace(noise=jnp.array([300.0, 1.0, 1.0]))
+    drawn = alternating._replace(noise=shot_noise(300.0, 1.0, random=True))
     sums = []
     for sensor in (alternating, drawn):
         state, votes = module.first_state(sensor, grey), []
@@ -914,13 +919,12 @@ def test_a_clean_sensor_among_faulty_ones_is_the_papers(textures):
     keys = jax.random.split(jax.random.key(0), 200)
     sensors = jax.jit(jax.vmap(partial(make, settings=settings)))(keys)
     faulty = jax.jit(jax.vmap(partial(make, settings=replace(settings, clean=0.0))))(keys)
-    clean = np.asarray(sensors.noise[:, 0]) == 0
+    clean = np.asarray(sensors.noise.rate) == 0
     assert 0.4 < clean.mean() < 0.6
     assert (np.asarray(sensors.refractory)[clean] == 1000 * TICKS).all()
-    assert (np.asarray(sensors.noise)[clean] == [0, 0.25, 0]).all()
     assert (np.asarray(sensors.cutoff)[clean][:, 1] == 1).all()
-    for name in ("on", "off", "refractory", "drift", "noise", "cutoff"):
-        mixed, usual = (np.asarray(getattr(s, name)) for s in (sensors, faulty))
+    for name in ("on", "off", "refractory", "drift", "noise.rate", "cutoff"):
+        mixed, usual = (np.asarray(attrgetter(name)(s)) for s in (sensors, faulty))
         np.testing.assert_array_equal(mixed[~clean], usual[~clean])
     swing = np.asarray(sensors.lamp.swing)
     assert not swing[clean].any() and (swing[~clean].max((1, 2)) > 0.4).all()
@@ -994,7 +998,7 @@ def test_each_sequence_has_the_renderings_that_it_needs(setups):
     fewest, most = 3, 9
     lengths = 0.05 / scenes.speed[0], 2 * most / scenes.speed[1]  # of windows: pixels
     bounds = of_both([np.arange(4) * int(1e6 * length) for length in lengths])
-    sensors = sensors._replace(noise=sensors.noise * jnp.array([[0, 1, 1]]))
+    sensors = sensors._replace(noise=sensors.noise._replace(rate=jnp.zeros(2)))
     made = simulate(sensors, scenes, bounds, renderings=(fewest, most), **SQUARE)[1]
     for b, number in enumerate((fewest, most)):
         alone = simulate(sensors, scenes, bounds, renderings=number, **SQUARE)[1]
@@ -1007,7 +1011,7 @@ def test_renderings_are_half_a_pixel_apart_and_enough_for_noise_and_light(setups
     sensors, scenes, bounds = setups
     sensor, scene = of_sequence(sensors, 1), of_sequence(scenes, 1)
     sensor = sensor._replace(
-        noise=jnp.array([0.0, 1.0, 1.0]), lamp=sensor.lamp._replace(swing=jnp.zeros((SIZE, SIZE)))
+        noise=shot_noise(0.0, 1.0), lamp=sensor.lamp._replace(swing=jnp.zeros((SIZE, SIZE)))
     )
     bounds = jnp.arange(7, dtype=jnp.int32) * 40_000
     needed = partial(sequences_module.renderings_needed, least=1, most=10_000, **SQUARE)
@@ -1016,7 +1020,7 @@ def test_renderings_are_half_a_pixel_apart_and_enough_for_noise_and_light(setups
     fastest = np.stack([speeds(scene, each, **SQUARE) for each in times.T]).max(1)
     apart = fastest * 0.04 / counts
     assert (apart <= 0.52).all() and apart.mean() > 0.3
-    noisy = sensor._replace(noise=jnp.array([5000.0, 1.0, 1.0]))
+    noisy = sensor._replace(noise=shot_noise(5000.0, 1.0, random=True))
     np.testing.assert_array_equal(needed(noisy, scene, bounds), 2 * 5000 * 0.04)
     lit = sensor._replace(lamp=sensor.lamp._replace(swing=jnp.full((SIZE, SIZE), 0.1)))
     assert (needed(lit, scene, bounds) == 10_000).all()

@@ -18,6 +18,7 @@ from firenet_jax.errors import SettingsError
 from firenet_jax.simulation.scenes import Scene, SceneSettings, log_uniform, random_scene
 from firenet_jax.simulation.sensor import (
     LEAST_THRESHOLD,
+    Noise,
     Sensor,
     SensorSettings,
     random_sensor,
@@ -153,7 +154,8 @@ def _uneven(sensors: Sensor, kind: jax.Array, is_slow: jax.Array, slow: float) -
         sensors = sensors._replace(on=uneven(sensors.on), off=uneven(sensors.off))
     share = jnp.where(kind < NEARLY_NOISELESS * slow, 0.02, 1.0)
     if sensors.noise is not None:
-        sensors = sensors._replace(noise=sensors.noise.at[:, 0].multiply(share))
+        calmer = sensors.noise._replace(rate=share * sensors.noise.rate)
+        sensors = sensors._replace(noise=calmer)
     if sensors.drift is not None:
         sensors = sensors._replace(drift=sensors.drift * share[:, None, None])
     return sensors
@@ -163,21 +165,22 @@ def _noisy_at_rest(
     key: jax.Array, sensors: Sensor, scenes: Scene, windows: int | jax.Array, duration: jax.Array
 ) -> Sensor:
     """The sensors, if noisy, with the noise of `AT_REST` in half of the sequences that stop."""
-    if sensors.noise is None:
+    usual = sensors.noise
+    if usual is None:
         return sensors
     seconds = 1e-6 * duration
     stopped = scenes.pauses[:, 0, 1] - scenes.pauses[:, 0, 0] > windows * seconds
     noisy, share = jax.random.uniform(key, (2, len(duration)))
     rate = log_uniform(AT_REST, share) / seconds
     chosen = stopped & (noisy < 0.5)
-    drawn = noisy < 0.25
-    uniform = jnp.stack([rate, jnp.ones_like(rate), drawn.astype(rate.dtype)], -1)
-    slope = sensors.noise_slope
+    slope = usual.slope
     if slope is not None:
         equal = jax.random.uniform(jax.random.fold_in(key, 1), rate.shape) < EQUAL_AT_REST
         slope = jnp.where(chosen & equal, 0.0, slope)
-    noise = jnp.where(chosen[:, None], uniform, sensors.noise)
-    return sensors._replace(noise=noise, noise_slope=slope)
+    uniform = Noise(rate, jnp.ones_like(rate), slope, noisy < 0.25)
+    usual = usual._replace(slope=slope)
+    noise = jax.tree.map(lambda rest, usual: jnp.where(chosen, rest, usual), uniform, usual)
+    return sensors._replace(noise=noise)
 
 
 def window_bounds(durations: jax.Array, windows: int, first: jax.Array | int = 0) -> jax.Array:

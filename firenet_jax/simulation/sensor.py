@@ -188,6 +188,15 @@ class Lamp(NamedTuple):
     start: jax.Array  # () cycles at the first rendering
 
 
+class Noise(NamedTuple):
+    """Events that nothing in the scene causes (shot noise)."""
+
+    rate: jax.Array  # () events per second and pixel in the dark
+    light: jax.Array  # () factor in full light, to which the rate falls linearly
+    slope: jax.Array | None  # () of the rate's logarithm over intensity, in place of that
+    random: jax.Array  # () bool, whether polarities are random; else they alternate
+
+
 class Sensor(NamedTuple):
     """The sensor of one sequence. A fault that is off is None and costs nothing."""
 
@@ -195,10 +204,7 @@ class Sensor(NamedTuple):
     off: jax.Array
     refractory: jax.Array | None  # () int32, ticks
     drift: jax.Array | None  # (H, W) apparent rise of L in log intensity per second
-    noise: jax.Array | None  # (3,) events per second and pixel in the dark; factor in full light; 1
-    # if polarities are random, 0 if they alternate
-    noise_slope: jax.Array | None  # () of the noise's logarithm over intensity, in place of that
-    # factor; None: it falls linearly
+    noise: Noise | None
     cutoff: jax.Array | None  # (2,) hertz in full light; factor in the dark
     phase: jax.Array | None  # (H, W) share of the first threshold already crossed where L drifts,
     # and whether noise starts with ON; otherwise all pixels would start with the same event
@@ -272,17 +278,19 @@ def random_sensor(
     else:
         refractory = jnp.float32(_or(settings.refractory, REFRACTORY))
     silenced = settings.refractory_range is not None or settings.refractory != 0
-    noise = slope = cutoff = None
+    noise = cutoff = None
     if _on(settings.noise):
-        noise = jnp.stack([log_uniform(settings.noise, next(numbers)), NOISE_IN_LIGHT, 0.0])
+        slope = None
         if settings.noise_in_light is not None:
             low, high = map(math.log, settings.noise_in_light)
             slope = jax.random.uniform(jax.random.fold_in(key, 8), minval=low, maxval=high)
+        rate = log_uniform(settings.noise, next(numbers))
+        noise = Noise(rate, jnp.float32(NOISE_IN_LIGHT), slope, jnp.bool_(False))
     if _on(settings.cutoff):
         cutoff = jnp.stack([log_uniform(settings.cutoff, next(numbers)), settings.cutoff_dark])
     refractory = jnp.round(refractory * 1e6 * TICKS).astype(jnp.int32) if silenced else None
     lamp = _lamp(jax.random.fold_in(key, 7), shape, settings.flicker)
-    sensor = Sensor(on, off, refractory, drift, noise, slope, cutoff, phase, start, lamp, noise_key)
+    sensor = Sensor(on, off, refractory, drift, noise, cutoff, phase, start, lamp, noise_key)
     if not settings.clean:
         return sensor
     clean_key, plain_key = jax.random.split(jax.random.fold_in(key, 6))
@@ -317,8 +325,7 @@ def _without_faults(sensor: Sensor, clean: jax.Array, spread: jax.Array) -> Sens
         off=unless(off, sensor.off),
         refractory=unless(refractory, sensor.refractory),
         drift=unless(0.0, sensor.drift),
-        noise=unless(jnp.array([0.0, NOISE_IN_LIGHT, 0.0]), sensor.noise),
-        noise_slope=unless(0.0, sensor.noise_slope),
+        noise=sensor.noise and sensor.noise._replace(rate=unless(0.0, sensor.noise.rate)),
         cutoff=unless(jnp.array([1e9, 1.0]), sensor.cutoff),  # so high that it has no effect
         lamp=sensor.lamp and sensor.lamp._replace(swing=unless(0.0, sensor.lamp.swing)),
     )
@@ -400,14 +407,12 @@ def step(
     runs, noise_on = (run,), state.noise_on
     if sensor.noise is not None and noise_on is not None:
         key = jax.random.fold_in(sensor.key, state.renderings)
-        rate, light, drawn = sensor.noise
-        if sensor.noise_slope is None:
-            expected = seconds * rate * (1 - (1 - light) * image)
-        else:
-            expected = seconds * rate * jnp.exp(sensor.noise_slope * image)
+        rate, light, slope, drawn = sensor.noise
+        share = 1 - (1 - light) * image if slope is None else jnp.exp(slope * image)
+        expected = seconds * rate * share
         bits = jax.random.bits(key, image.shape, jnp.uint32)
         # The time of the event uses the upper 24 bits, so the lowest bit is independent of it.
-        noise_on = jnp.where(drawn > 0, bits % 2 == 1, noise_on)
+        noise_on = jnp.where(drawn, bits % 2 == 1, noise_on)
         noise = _shot_noise(bits, expected, jnp.where(noise_on, 1.0, -1.0), ticks)
         noise_on = noise_on ^ (noise.count > 0)
         runs += (noise,)
@@ -467,9 +472,10 @@ def _shot_noise(bits: jax.Array, expected: jax.Array, polarity: jax.Array, ticks
     return Run(first, jnp.zeros_like(first), fires.astype(jnp.int32), polarity)
 
 
-def most_noise(noise: jax.Array, slope: jax.Array | None) -> jax.Array:
+def most_noise(noise: Noise) -> jax.Array:
     """Events per second where there are most, in the dark or in full light."""
-    return noise[0] if slope is None else noise[0] * jnp.exp(jnp.maximum(slope, 0.0))
+    rate, slope = noise.rate, noise.slope
+    return rate if slope is None else rate * jnp.exp(jnp.maximum(slope, 0.0))
 
 
 def stamps(first, spacing, number):
@@ -517,7 +523,7 @@ def _dense(
     intensity is linear from one of those that are given to the next."""
     rate, last = 0.0, None
     if sensor.noise is not None:
-        rate = 2e-6 * float(most_noise(sensor.noise, sensor.noise_slope))  # per microsecond
+        rate = 2e-6 * float(most_noise(sensor.noise))  # per microsecond
     for time, image in renderings:
         time, image = int(time), jnp.asarray(image, jnp.float32)
         if rate and last is not None:

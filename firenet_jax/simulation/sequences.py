@@ -101,7 +101,7 @@ def renderings_needed(
     seen = speeds(scene, times.ravel(), height=height, width=width).reshape(times.shape)
     needed = duration * 1.1 * seen.max(-1) / 0.5  # 10 % for what is faster between these times
     if sensor.noise is not None:
-        needed = jnp.maximum(needed, 2 * duration * most_noise(sensor.noise, sensor.noise_slope))
+        needed = jnp.maximum(needed, 2 * duration * most_noise(sensor.noise))
     if sensor.lamp is not None:
         needed = jnp.where(sensor.lamp.swing.max() > 0, most, needed)
     return jnp.clip(jnp.ceil(needed), least, most).astype(jnp.int32)
