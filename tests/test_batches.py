@@ -202,6 +202,9 @@ def test_hot_pixels_stay_and_noise_does_not(noise):
     assert not np.allclose(added[2][0, ..., 0], values, atol=1e-3)  # the next chain
     shares = (np.abs(values) > 1e-5).mean((1, 2))
     assert (shares < 0.55).all() and shares.max() > 0.05 and len(set(shares)) == BATCH
+    assert np.ptp(shares) > 0.2  # drawn for each sequence: of one share they differ by about 0.05
+    drawn = values[np.abs(values) > 1e-5]
+    assert drawn.std() == pytest.approx(1, abs=0.2) and abs(drawn.mean()) < 0.2
     added = np.stack([b.tensors - a.tensors for a, b in zip(bare, noisy, strict=True)])
     assert added.std() == pytest.approx(0.1, rel=0.02) and abs(added.mean()) < 0.002
     flat = added.reshape(-1, CROP * CROP * 5)

@@ -1,6 +1,7 @@
 import dataclasses
 import itertools
 import json
+import shutil
 import signal
 import sys
 import time
@@ -17,7 +18,7 @@ import pytest
 from processes import FEW_OPTIMISATIONS, finish, start, together
 
 from firenet_jax.checkpoint import load_weights, save_weights
-from firenet_jax.errors import OutputError
+from firenet_jax.errors import CheckpointError, FirenetError, OutputError
 from firenet_jax.events import Events
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.simulation.curricula import window_bounds
@@ -30,7 +31,7 @@ from firenet_jax.storage.sequence_file import Picture, write_sequence
 from firenet_jax.training import run as train
 from firenet_jax.training import settings as train_settings
 from firenet_jax.training import step as train_steps
-from firenet_jax.training.batches import Augment
+from firenet_jax.training.batches import NO_AUGMENT, Augment
 from firenet_jax.training.log import Log
 from firenet_jax.training.losses import Loss
 from firenet_jax.training.run import Train, first_state, run
@@ -59,6 +60,10 @@ def losses(folder):
     return [(e["step"], e["kind"], e["loss"]) for e in entries(folder)]
 
 
+def steps_of(folder):
+    return [step for step, kind, _ in losses(folder) if kind == "train"]
+
+
 class Killed(Exception):
     pass
 
@@ -69,7 +74,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(tmp_path, monkeypatch, 
     settings = tiny(tmp_path / "run", optimiser="centred")
     run(settings)
     expected = losses(tmp_path / "run")
-    assert [step for step, kind, _ in expected if kind == "train"] == [1, 2, 3, 4, 5, 6]
+    assert steps_of(tmp_path / "run") == [1, 2, 3, 4, 5, 6]
     (tmp_path / "run").rename(tmp_path / "whole")
 
     original = train.train_step
@@ -93,21 +98,17 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(tmp_path, monkeypatch, 
 
 TOGETHER = """
 import sys
-import time
 from pathlib import Path
-from unittest.mock import Mock
-from firenet_jax.storage.sequence_file import Picture, write_sequence
-from firenet_jax.errors import OutputError
-from firenet_jax.events import Events
 from firenet_jax.training.losses import Loss
 from firenet_jax.simulation.scenes import SceneSettings
-from firenet_jax.simulation.textures import load_textures
+from firenet_jax.simulation.sensor import SensorSettings
 from firenet_jax.training.run import Train, run
 
 folder, chain, *where = sys.argv[1:]
 coordinator, processes, process = (where[0], int(where[1]), int(where[2])) if where else [None] * 3
 run(Train(Path(folder), batch=4, crop=32, windows=3, textures=4, log_every=1,
-    validate_every=10, save_every=0.0, loss=Loss(l0=1), scene=SceneSettings(objects=0),
+    validate_every=10, save_every=1e9, loss=Loss(nlpd=0, haarpsi=0, l0=1),
+    scene=SceneSettings(objects=0), sensor=SensorSettings(noise=(1.0, 10.0)),
     optimiser="centred", chain=int(chain),
     coordinator=coordinator, processes=processes, process=process), stop=10)
 """
@@ -220,7 +221,6 @@ def simulated_steps(asked, key, textures, count):
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_sequences_of_a_batch_are_of_different_ages_and_go_on_where_they_were(tmp_path):
     asked = tiny(tmp_path, chain=4, sensor=replace(FAULTY, mid_recording=True))
     settings = asked.step_settings
@@ -231,25 +231,25 @@ def test_sequences_of_a_batch_are_of_different_ages_and_go_on_where_they_were(tm
     seen, warm = simulated_steps(asked, key, textures, 4)
     assert warm == [[False, False], [True, True], [False, True], [True, True]]
 
-    def whole(number, windows):
+    @jax.jit
+    def whole(number):
         numbers = jnp.full(2, number, jnp.int32)
         *both, durations = train_steps._setups(
             key, textures, settings, jnp.asarray(lengths), numbers
         )
-        bounds = window_bounds(durations, windows)
+        bounds = window_bounds(durations, 12)
         return simulate(*both, bounds, height=32, width=32, renderings=5)[1].tensors
 
-    seen, first = np.concatenate(seen), whole(0, 12)
-    # Two programs: rounding moves one event in ten thousand, by up to 6e-4 of its weight.
+    seen, first = np.concatenate(seen), whole(0)
+    # Two programs: rounding moves four events in ten thousand, by up to 6e-4 of its weight.
     for part, alone in ((seen[:, 1], first[:, 1]), (seen[:6, 0], first[:6, 0]),
-                        (seen[6:, 0], whole(1, 6)[:, 0])):  # fmt: skip
+                        (seen[6:, 0], whole(1)[:6, 0])):  # fmt: skip
         np.testing.assert_allclose(part, alone, atol=1e-3)
-        assert (np.abs(part - alone) > 1e-4).mean() < 1e-4
+        assert (np.abs(part - alone) > 1e-4).mean() < 1e-3
     assert not np.allclose(seen[6:, 0], first[6:, 0], atol=0.5)
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_sequences_to_and_fro_are_the_same_windows_in_every_step(tmp_path):
     asked = tiny(tmp_path, chain=4, windows=6, to_and_fro=1.0, loss=Loss(l0=2))
     textures, key = jnp.asarray(load_textures(None, 4, 64, 0, procedural=1.0)), jax.random.key(1)
@@ -310,17 +310,45 @@ def test_remat_and_bfloat16_change_little(tmp_path):
     params = first_state(settings).params
     tensors = jax.random.normal(jax.random.key(1), (3, 1, 16, 16, 5))
 
+    def energy(settings, params):
+        return (images_of(params, tensors, settings.step_settings)[1] ** 2).sum()
+
     def gradient(settings):
-        def energy(params):
-            return (images_of(params, tensors, settings.step_settings)[1] ** 2).sum()
+        return jax.jit(jax.grad(partial(energy, settings)))(params)
 
-        return jax.jit(jax.grad(energy))(params)
+    def kept(**choices):
+        """Bytes of what the gradient needs of the forward pass."""
+        back = jax.eval_shape(
+            lambda params: jax.vjp(partial(energy, replace(settings, **choices)), params)[1], params
+        )
+        return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(back))
 
+    for half in (False, True):  # on a CPU these keep different things without remat
+        assert kept(bfloat16=half, remat=True) < 0.7 * kept(bfloat16=half)
     exact, again = gradient(settings), gradient(replace(settings, remat=True))
     rough = gradient(replace(settings, bfloat16=True))
+    off = []
     for a, b, c in zip(*map(jax.tree.leaves, (exact, again, rough)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5 * np.abs(a).max())
-        assert np.abs(a - c).max() < 0.1 * np.abs(a).max()
+        off.append(np.abs(a - c).max() / np.abs(a).max())
+    assert 1e-3 < max(off) < 0.1
+
+
+@pytest.fixture
+def scores(monkeypatch):
+    """Runs in which nothing is computed: each step adds one to the parameters, and a validation
+    gives these scores."""
+    given = {"loss": 1.0}
+
+    def step(state, source, settings):
+        params = jax.tree.map(lambda leaf: leaf + 1, state.params)
+        return state._replace(params=params, step=state.step + 1), {"loss": 0.0}
+
+    monkeypatch.setattr(train, "train_step", step)
+    monkeypatch.setattr(train, "validate", lambda *_: (given, ()))
+    monkeypatch.setattr(train, "sources_of", lambda *_: (itertools.repeat(0), [lambda: 0]))
+    monkeypatch.setattr(Log, "show", lambda *_: None)
+    return given
 
 
 def begun(folder, settings):
@@ -349,20 +377,18 @@ def test_a_run_that_began_with_other_weights_is_told(tmp_path, caplog):
     assert "has changed" not in caplog.text
 
 
-@pytest.mark.slow
-def test_a_run_goes_on_without_the_weights_that_it_began_with(tmp_path, caplog):
+def test_a_run_goes_on_without_the_weights_that_it_began_with(tmp_path, caplog, scores):
     weights = Weights(initial_params(jax.random.key(7)), normalise=True)
     for name in ("all", "parts"):
         save_weights(tmp_path / "w.npz", weights)
-        choices = {"weights": tmp_path / "w.npz", "steps": 4}
+        choices = {"weights": tmp_path / "w.npz", "steps": 4, "save_every": 1e9}
         if name == "parts":
             run(tiny(tmp_path / name, **choices), stop=2)
             (tmp_path / "w.npz").unlink()
         run(tiny(tmp_path / name, **choices))
-    assert "going on after step 2" in caplog.text
-    np.testing.assert_array_equal(
-        *(load_weights(tmp_path / name).params["head"]["kernel"] for name in ("all", "parts"))
-    )
+    assert "going on after step 2" in caplog.text and steps_of(tmp_path / "parts") == [1, 2, 3, 4]
+    last = (load_weights(tmp_path / name / "last.npz").params for name in ("all", "parts"))
+    jax.tree.map(np.testing.assert_array_equal, *last)
 
 
 def test_the_folder_of_a_simulation_is_none_of_a_run(tmp_path):
@@ -504,8 +530,9 @@ def test_a_short_run_warms_up_in_fewer_steps(tmp_path):
     assert train_settings.warming_up(Train(tmp_path, steps=300, warmup=200)) == 200
 
 
-@pytest.mark.slow
-def test_a_finished_run_is_lengthened_and_ctrl_c_saves(tmp_path, monkeypatch, caplog, interrupts):
+def test_a_finished_run_is_lengthened_and_ctrl_c_saves(
+    tmp_path, monkeypatch, caplog, interrupts, scores
+):
     run(tiny(tmp_path, steps=2))
     with pytest.raises(ValueError, match="steps was 2, now 1"):
         run(tiny(tmp_path, steps=1, warmup=0))
@@ -529,8 +556,7 @@ def test_a_finished_run_is_lengthened_and_ctrl_c_saves(tmp_path, monkeypatch, ca
         run(tiny(tmp_path, steps=8))
     run(tiny(tmp_path, steps=6, save_every=1e6))
     assert "going on after step 4" in caplog.text
-    steps = [step for step, kind, _ in losses(tmp_path) if kind == "train"]
-    assert steps == [1, 2, 3, 4, 5, 6]
+    assert steps_of(tmp_path) == [1, 2, 3, 4, 5, 6]
 
 
 def test_files_of_others_are_not_replaced(tmp_path):
@@ -627,15 +653,20 @@ def test_trains_on_files_and_resumes(tmp_path, chain):
     choices = {"data": (tmp_path / "set",), "chain": chain, "steps": 4}
     settings = tiny(tmp_path / "whole", **choices)
     run(settings)
-    assert [step for step, kind, _ in losses(tmp_path / "whole") if kind == "train"] == [1, 2, 3, 4]
+    assert steps_of(tmp_path / "whole") == [1, 2, 3, 4]
 
     state, sources = first_state(settings), train.sources_of(settings, 0)[0]
     seen = []
     for number in range(4):
         if number == 3:
             sources = train.sources_of(settings, 3)[0]
-        state, terms = train_step(state, next(sources), settings.step_settings)
+        data, copy = next(sources), jax.tree.map(jnp.copy, state)
+        state, terms = train_step(state, data, settings.step_settings)
         seen.append(float(terms["loss"]))
+        if number and chain > 1:  # an odd step goes on with the network's state, others do not
+            forgetful = copy._replace(carried=jax.tree.map(jnp.zeros_like, copy.carried))
+            other = float(train_step(forgetful, data, settings.step_settings)[1]["loss"])
+            assert (abs(other - seen[-1]) > 1e-3) == bool(number % 2)
     assert seen == [loss for _, kind, loss in losses(tmp_path / "whole") if kind == "train"]
 
 
@@ -673,18 +704,88 @@ def test_textures_to_validate_on_are_cut_anew(tmp_path, monkeypatch):
     assert training != validation
 
 
-def test_a_run_that_goes_on_keeps_weights_that_did_better_before(tmp_path, monkeypatch):
-    """Nothing is computed: each step adds one to the biases, each run validates to one loss."""
-    scores = {}
+def test_validation_on_files_is_on_other_files_as_they_are(tmp_path, monkeypatch):
+    asked = []
 
-    def step(state, source, settings):
-        params = jax.tree.map(lambda leaf: leaf + 1, state.params)
-        return state._replace(params=params, step=state.step + 1), {"loss": 0.0}
+    def numbered(files, *, augment, **_):
+        asked.append((files, augment))
+        return (number for number in range(100))  # it can be closed
 
-    monkeypatch.setattr(train, "train_step", step)
-    monkeypatch.setattr(train, "validate", lambda *_: (scores, ()))
-    monkeypatch.setattr(train, "sources_of", lambda *_: (itertools.repeat(0), [lambda: 0]))
+    monkeypatch.setattr(train, "batches", numbered)
+    monkeypatch.setattr(train, "split", lambda _: (["a"], ["b"]))
+    _, validation = train.sources_of(tiny(tmp_path, data=(tmp_path,)), 0)
+    assert asked == [(["a"], Augment()), (["b"], NO_AUGMENT)]
+    assert [make() for make in validation] == list(range(train.VALIDATION))
+
+
+def test_a_validation_is_the_mean_of_its_batches(tmp_path, monkeypatch):
+    monkeypatch.setattr(train, "validate", lambda _, data, __: ({"loss": data}, ()))
     monkeypatch.setattr(Log, "show", lambda *_: None)
+    settings = tiny(tmp_path)
+    judge = partial(train._judge, 3, first_state(settings), settings=settings)
+    made = [lambda: 1.0, lambda: 2.0, lambda: 6.0]
+    log = Log(tmp_path, 0)
+    assert judge(validation=made, log=log, best=4.0) == 3.0
+    log.close()
+    assert losses(tmp_path) == [(3, "validation", 3.0)]
+    assert (tmp_path / "weights.npz").exists()  # 3 is less than 4
+
+
+def test_metrics_of_a_validation_are_of_clipped_images_from_l0_on(tmp_path, monkeypatch):
+    settings, shape = tiny(tmp_path).step_settings, (3, 2, 32, 32)
+    truths = jnp.round(jax.random.uniform(jax.random.key(0), shape))
+    images = jnp.where(truths > 0, 1.5, -0.5).at[: SHORT.l0].set(0.3)
+    data = Simulation(jnp.zeros((*shape, 5)), truths, jnp.zeros((*shape, 2)), truths > 0)
+    monkeypatch.setattr(train_steps, "loss_of", lambda *_: (jnp.zeros(()), ({}, None, images)))
+    train_steps.validate.clear_cache()  # it is traced with the loss above, and with no other
+    scores, pictures = train_steps.validate({}, data, settings)
+    train_steps.validate.clear_cache()
+    assert scores["mse"] == 0 and scores["ssim"] == pytest.approx(1)
+    np.testing.assert_array_equal(pictures[0], images[:, 0])
+
+
+def test_the_learning_rate_warms_up_and_decays_to_a_hundredth(tmp_path):
+    asked = tiny(tmp_path, optimiser="adam", steps=50, warmup=5, learning_rate=1e-2)
+    optimiser = train_steps.optimiser(asked.step_settings)
+    params, sizes, update = {"bias": jnp.ones(4)}, [], jax.jit(optimiser.update)
+    state = optimiser.init(params)
+    for _ in range(51):  # Adam's update by a constant gradient is as large as the rate
+        change, state = update(params, state, params)
+        sizes.append(float(-change["bias"][0]))
+    np.testing.assert_allclose(sizes[:6], np.linspace(0, 1e-2, 6), rtol=1e-3)
+    assert (np.diff(sizes[5:]) < 0).all() and sizes[50] == pytest.approx(1e-4, rel=1e-3)
+
+
+def test_ten_steps_in_a_row_without_a_finite_gradient_end_a_run(tmp_path, monkeypatch, scores):
+    original = train.train_step
+
+    def without(state, *args):
+        state, terms = original(state, *args)
+        optimiser = state.optimiser._replace(notfinite_count=jnp.int32(state.step))
+        return state._replace(optimiser=optimiser), terms
+
+    monkeypatch.setattr(train, "train_step", without)
+    with pytest.raises(FirenetError, match="ten steps in a row had no finite gradient"):
+        run(tiny(tmp_path, steps=12, save_every=1e9))
+    assert steps_of(tmp_path) == list(range(1, 11))  # nine did not end it
+
+
+def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(tmp_path, scores):
+    run(tiny(tmp_path), stop=3)
+    newest = tmp_path / "checkpoints/3"
+    assert {path.name for path in newest.parent.iterdir()} == {"2", "3"}
+    for path in newest.rglob("*"):
+        if path.is_file():
+            path.write_bytes(b"")
+    with pytest.raises(CheckpointError, match=f"{newest} is damaged .*: remove it, and the run go"):
+        run(tiny(tmp_path))
+    shutil.rmtree(newest)
+    run(tiny(tmp_path), stop=4)
+    assert steps_of(tmp_path) == [1, 2, 3, 4]
+    assert load_weights(tmp_path / "last.npz").params["head"]["bias"][0] == 4
+
+
+def test_a_run_that_goes_on_keeps_weights_that_did_better_before(tmp_path, scores):
     kept = []
     for scores["loss"], stop in ((1.0, 3), (2.0, 5), (0.5, 6)):
         run(tiny(tmp_path), stop=stop)
@@ -693,8 +794,7 @@ def test_a_run_that_goes_on_keeps_weights_that_did_better_before(tmp_path, monke
     assert load_weights(tmp_path / "last.npz").params["head"]["bias"][0] == 6
 
 
-@pytest.mark.slow
-def test_a_run_whose_best_weights_are_gone_says_so_and_keeps_new_ones(tmp_path, capsys):
+def test_a_run_whose_best_weights_are_gone_says_so_and_keeps_new_ones(tmp_path, capsys, scores):
     run(tiny(tmp_path, steps=2, validate_every=1))
     (tmp_path / "weights.npz").unlink()
     run(tiny(tmp_path, steps=2, validate_every=1))
@@ -704,8 +804,7 @@ def test_a_run_whose_best_weights_are_gone_says_so_and_keeps_new_ones(tmp_path, 
     assert load_weights(tmp_path)
 
 
-@pytest.mark.slow
-def test_a_run_of_before_the_warm_up_had_no_default_goes_on(tmp_path):
+def test_a_run_of_before_the_warm_up_had_no_default_goes_on(tmp_path, scores):
     run(tiny(tmp_path, steps=3, warmup=None), stop=1)
     path = tmp_path / "settings.json"
     record = json.loads(path.read_text())
