@@ -145,17 +145,11 @@ def _checked(weights: Weights, state: State, tensors, valid):
     """`reconstruct`'s arrays in float32. Raises ValueError if they do not match, TypeError for
     other objects in place of weights or state."""
     _check_weights(weights)
-    check_state(state)
     check_arrays(tensors=tensors, valid=valid)
     if jnp.ndim(tensors) != 5 or jnp.shape(tensors)[-1] != BINS:
         raise ValueError(f"event tensors are (T, B, H, W, {BINS}), not {jnp.shape(tensors)}")
     shape = jnp.shape(tensors)[:4]
-    for name, h in state._asdict().items():
-        if jnp.shape(h) != (*shape[1:], CHANNELS):
-            raise ValueError(
-                f"the state's {name} is {jnp.shape(h)}, but event tensors {(*shape, BINS)} need "
-                f"{(*shape[1:], CHANNELS)}: make it with initial_state(batch, height, width)"
-            )
+    state = _checked_state(state, shape)
     if valid is not None:
         if jnp.shape(valid) not in (shape[:2], (shape[0], 1)):
             raise ValueError(
@@ -167,8 +161,19 @@ def _checked(weights: Weights, state: State, tensors, valid):
         valid = jnp.broadcast_to(valid, shape[:2])
     _check_params(weights.params)
     params = _as_float32(weights.params, "parameters")
-    state, tensors = _as_float32(state, "state"), _as_float32(tensors, "event tensors")
-    return replace(weights, params=params), state, tensors, valid
+    return replace(weights, params=params), state, _as_float32(tensors, "event tensors"), valid
+
+
+def _checked_state(state: State, shape: tuple[int, ...]) -> State:
+    """A state in float32, if it suits event tensors of this shape (T, B, H, W)."""
+    check_state(state)
+    for name, h in state._asdict().items():
+        if jnp.shape(h) != (*shape[1:], CHANNELS):
+            raise ValueError(
+                f"the state's {name} is {jnp.shape(h)}, but event tensors {(*shape, BINS)} need "
+                f"{(*shape[1:], CHANNELS)}: make it with initial_state(batch, height, width)"
+            )
+    return _as_float32(state, "state")
 
 
 def _check_weights(weights) -> None:
@@ -252,7 +257,7 @@ def reconstruct_at(
     As `reconstruct`, but some of the steps are looks. Not differentiable.
     """
     weights, last, tensors, valid = _checked(weights, committed.last, tensors, valid)
-    _, before, _, _ = _checked(weights, committed.before, tensors, valid)
+    before = _checked_state(committed.before, tensors.shape[:4])
     if valid is None:
         valid = jnp.ones(tensors.shape[:2], bool)
     committed = Committed(before, last)

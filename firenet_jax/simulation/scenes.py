@@ -287,10 +287,10 @@ def _dice(key: jax.Array, count: int):
         low, high = bounds
         return low + (high - low) * numbers[first:place].reshape(shape)
 
-    def log_uniform(bounds, shape=()):
-        return jnp.exp(uniform([math.log(bound) for bound in bounds], shape))
+    def log_uniformly(bounds, shape=()):
+        return log_uniform(bounds, uniform((0.0, 1.0), shape))
 
-    return uniform, log_uniform
+    return uniform, log_uniformly
 
 
 def _whole(numbers: jax.Array, count: int) -> jax.Array:
