@@ -21,13 +21,12 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from firenet_jax.evaluation import metrics
-from firenet_jax.evaluation.comparison import to_8_bit
 from firenet_jax.evaluation.equalise import equalise
 from firenet_jax.evaluation.methods import Method, Missing, load
 from firenet_jax.evaluation.protocol import CUTS
 from firenet_jax.events import Frames, Recording, concatenate
 from firenet_jax.filters import between
-from firenet_jax.pictures import event_pictures
+from firenet_jax.pictures import event_pictures, to_8_bit
 from firenet_jax.readers import open_recording
 from firenet_jax.simulation.scenes import (
     SceneSettings,
@@ -163,7 +162,7 @@ def simulated(
     def truth(time: int) -> np.ndarray:
         return np.asarray(render(scene, 1e-6 * time, **size).image)
 
-    frames = Frames(times, lambda i: to_8_bit(truth(int(times[i]))))
+    frames = Frames(times, lambda i: np.asarray(to_8_bit(truth(int(times[i])))))
     recording = Recording(
         Path(name), "simulated", height, width, lambda: iter([events]), len(events), frames
     )
@@ -225,7 +224,7 @@ def picture(image, kind: str) -> np.ndarray | str:
     """An image (H, W) -> (H, W) uint8, equalised; the words of a gap go through."""
     if image is None:
         return "no frame"
-    return image if isinstance(image, str) else to_8_bit(equalise(image, kind))
+    return image if isinstance(image, str) else np.asarray(to_8_bit(equalise(image, kind)))
 
 
 def errors(image, truth, kind: str = "local") -> dict[str, float]:
