@@ -103,7 +103,7 @@ def run(
                 if done % settings.log_every == 0 or done == last:
                     terms = log.write(done, "train", terms)
                     progress.set_postfix(loss=f"{terms['loss']:.3f}", refresh=False)
-                    _check_finite(terms, state, folder)
+                    _check_finite(state, folder)
                 if done % settings.validate_every == 0 or done == last:
                     best = _judge(done, state, validation, settings, log, best)
                 if done == last or (done % settings.log_every == 0 and _due(last_save, settings)):
@@ -274,7 +274,7 @@ def _sharded(data: Simulation) -> Simulation:
     return jax.tree.map(share_of, data)
 
 
-def _check_finite(terms: dict[str, float], state: TrainState, folder: Path) -> None:
+def _check_finite(state: TrainState, folder: Path) -> None:
     if int(state.optimiser.notfinite_count) >= 10:
         raise FirenetError(
             f"{folder}: ten steps in a row had no finite gradient, training has diverged: start "
