@@ -36,6 +36,7 @@ from firenet_jax.windows import MAX_GAP, Window, Windows, cut
 
 WARM_UP = 20  # windows
 MOST_WARMING = 0.4  # events per pixel and window, slightly more than in usual windows
+PART = 0.5  # events per pixel of a dense window's parts
 MAX_RATE = 1_000_000  # images per second: times are whole microseconds
 
 
@@ -46,6 +47,8 @@ class Step(NamedTuple):
     time: int | None  # int64 us of a look's image; None: the new state is kept, without an image
     share: float  # s: a step starts from (1 - s) S[k-1] + s S[k], the last two kept states
     new: int = 0  # how many of a look's last events came after the last kept step
+    earlier: int = 0  # events of the same window in earlier steps
+    later: int = 0  # and in later ones: the window's image is that of the last
 
 
 @dataclass
@@ -142,6 +145,27 @@ def warming(
     forwards = [window.events for window in seen]
     backwards = [events.backwards() for events in reversed(forwards)]
     return [Step(events, None, 1.0) for events in forwards + backwards], again()
+
+
+def in_parts(step: Step, pixels: int) -> list[Step]:
+    """A window's step -> as many as it holds halves of an event per pixel, rounded, at least one:
+    equal parts of its events, the last of which has its image.
+
+    In a dense window things move far, and its image washes out (experiments/endurance.py). Its
+    parts are windows like others, and the image is still that of its end.
+    """
+    events, count = step.events, len(step.events)
+    parts = max(1, round(count / (PART * pixels)))
+    edges = [count * k // parts for k in range(parts + 1)]
+    return [
+        step._replace(
+            events=events.select(slice(start, stop)),
+            time=step.time if stop == count else None,
+            earlier=start,
+            later=count - stop,
+        )
+        for start, stop in itertools.pairwise(edges)
+    ]
 
 
 def _in_order(times: Iterable[int]) -> Iterator[int]:

@@ -51,6 +51,11 @@ class Network:
     recurrent: bool = True
     """With --no-recurrent each window starts from a zero state (the ablation in Fig. 5 of the
     paper). By default the state is carried from window to window."""
+    whole_windows: bool = False
+    """Take every window in one step, as the original program does. By default a window of 0.75 or
+    more events per pixel is taken in several steps, of about half an event per pixel each, and its
+    image is that of the last: in one step, dense windows wash out. Windows that overlap, and those
+    of images at given times, are taken whole."""
     bfloat16: bool = False
     """Compute convolutions in bfloat16, slightly less accurate. For accelerators; slower on a
     CPU."""
@@ -413,6 +418,7 @@ def events_to_pictures(
     events: Packed,
     valid: jax.Array,
     steps: Looks | None = None,
+    seen: jax.Array | None = None,
     *,
     height: int,
     width: int,
@@ -430,6 +436,7 @@ def events_to_pictures(
     beside the reconstruction.
     valid: (T, B) bool, as in `reconstruct`.
     steps: which steps are looks, for a session `at_times`; pictures of kept steps are undefined.
+    seen: (T, B) bool: which images the intensity range is drawn from; None: all.
     rotated: the events are rotated by 180 degrees, and with them a sensor's colour filter array.
     raw: the network's images, (T, B, H, W) float32, in place of pictures.
     mesh: devices that share the B recordings equally, for events from `pack_for_devices`.
@@ -442,7 +449,7 @@ def events_to_pictures(
     def all_at_once(weights, state, inputs, valid):
         return run(replace(weights, normalise=False), state, normalise(inputs), valid)
 
-    def shown(weights, session, inputs, valid, steps):
+    def shown(weights, session, inputs, valid, steps, seen):
         height, width = inputs.shape[2:4]
         (top, bottom), (left, right) = sides = padding(height, width, network.pad)
         inputs = jnp.pad(inputs, ((0, 0), (0, 0), *sides, (0, 0)), mode="reflect")
@@ -462,21 +469,22 @@ def events_to_pictures(
         if raw:
             images = images[:, :, top : top + height, left : left + width]
             return Session(state, session.display), images
+        valid = valid if seen is None else valid & seen
         # As in the original program, the mask and the intensity range see the padded image.
         ranges, greys = display(session.display, images, valid, settings=settings)
         greys = greys[:, :, top : top + height, left : left + width]
         return Session(state, ranges), greys
 
-    def one_device(weights, session, events, valid, steps):
+    def one_device(weights, session, events, valid, steps, seen):
         tensors = voxelise(events, height=height, width=width)
         inputs = normalise(tensors) if early else tensors
-        after, pictures = shown(weights, session, inputs, valid, steps)
+        after, pictures = shown(weights, session, inputs, valid, steps, seen)
         if network.color:
             planes = colour.channels(inputs, rotated)  # (T, B, 3, H/2, W/2, 5)
             planes = planes.reshape(len(planes), -1, *planes.shape[3:])
             each = partial(jnp.repeat, repeats=3, axis=1)
             channels, shades = shown(
-                weights, _fold(session.channels), planes, *jax.tree.map(each, (valid, steps))
+                weights, _fold(session.channels), planes, *jax.tree.map(each, (valid, steps, seen))
             )
             shades = shades.reshape(len(planes), -1, 3, *shades.shape[2:])
             pictures = colour.coloured(pictures, shades, rotated)
@@ -488,6 +496,6 @@ def events_to_pictures(
         return after, pictures
 
     if mesh is not None:
-        specs = REPLICATED, BATCH, PACKED_SPECS, TIME_BATCH, TIME_BATCH
+        specs = REPLICATED, BATCH, PACKED_SPECS, TIME_BATCH, TIME_BATCH, TIME_BATCH
         one_device = on_each_device(one_device, specs, (BATCH, TIME_BATCH), mesh)
-    return one_device(weights, session, events, valid, steps)
+    return one_device(weights, session, events, valid, steps, seen)

@@ -128,11 +128,14 @@ def cut(
     windows: Windows,
     chunks: Iterable[Events] | None = None,
     begin: int | None = None,
+    *,
+    whole: bool = True,
 ) -> Iterator[Window]:
     """Recording -> its windows, as `windows` says.
 
     chunks: the recording's events after filters; None: unfiltered.
     begin: microseconds, where the first window in time begins; None: at the first event.
+    whole: a window is one step of the network, which is warned of where it is dense.
     Raises RecordingError if windows between frames are requested and the recording has no frames,
     and, for windows in time, if no event comes for more than an hour; SettingsError if the step is
     longer than the window of this sensor.
@@ -155,7 +158,8 @@ def cut(
     step = count if windows.step is None else int(windows.step)
     if step > count:
         raise SettingsError(f"step of {step} events is longer than the window, {count} events")
-    warn_if_unusual(count, recording.pixels)
+    most = count if whole else round(USUAL_DENSITY * recording.pixels)
+    warn_if_unusual(min(count, most), recording.pixels)
     if windows.longest is not None:
         return _by_count_or_time(chunks, count, round(1000 * windows.longest))
     return _by_count(chunks, count, step)

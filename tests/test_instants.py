@@ -11,7 +11,7 @@ from test_tensors import random_events
 from firenet_jax import native
 from firenet_jax.errors import RecordingError
 from firenet_jax.events import Events, Recording
-from firenet_jax.instants import Counts, Grid, grid, steps, warming
+from firenet_jax.instants import Counts, Grid, Step, grid, in_parts, steps, warming
 from firenet_jax.network import Weights, initial_params, initial_state, step
 from firenet_jax.pictures import display, initial_display_state
 from firenet_jax.reconstruction import (
@@ -43,6 +43,21 @@ def recording():
     events = random_events(rng, 700, HEIGHT, WIDTH)
     t = FIRST + (events.t - FIRST) ** 2 // 50_000
     return recording_of(Events(t // 10 * 10, events.x, events.y, events.p))
+
+
+@pytest.mark.parametrize("count, parts", [(0, 1), (1, 1), (149, 1), (151, 2), (249, 2), (1001, 10)])
+def test_a_dense_window_is_cut_into_equal_parts_of_half_an_event_per_pixel(count, parts):
+    """Of 200 pixels. All events, in order; the last part has the image."""
+    events = random_events(np.random.default_rng(count), count, 10, 20)
+    made = in_parts(Step(events, 77, 1.0), 200)
+    sizes = [len(step.events) for step in made]
+    assert len(made) == parts and max(sizes) - min(sizes) <= 1
+    for name in "txyp":
+        columns = [getattr(step.events, name) for step in made]
+        np.testing.assert_array_equal(np.concatenate(columns), getattr(events, name))
+    assert [step.time for step in made] == [None] * (parts - 1) + [77]
+    assert [step.earlier for step in made] == [0, *np.cumsum(sizes)[:-1]]
+    assert all(s.earlier + len(s.events) + s.later == count for s in made)
 
 
 WAYS = [{"events": 90}, {"events": 90, "longest": 4.0}, {"duration": 7.3}]

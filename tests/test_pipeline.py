@@ -105,6 +105,77 @@ def test_the_first_pictures_are_of_a_network_that_has_seen_the_beginning(tmp_pat
         settings(weights, (path,), tmp_path / "out", warm_up=-1)
 
 
+def test_a_dense_window_is_taken_in_steps_and_shown_at_its_end(tmp_path, weights, capsys):
+    """Three windows of 2.1 events per pixel: four steps each, in the warm-up too; a last one of
+    .52. As by hand, with windows of a fourth."""
+    plain = Weights(initial_params(jax.random.key(0)), False)
+    save_weights(weights, plain)
+    path = write_recording(tmp_path / "a.txt", 3250)
+    choices = {"windows": Windows(events=1000), "warm_up": 1, "batch": 1}
+    run(settings(weights, (path,), tmp_path / "a.h5", **choices))
+    assert "windows of 1,000 events, in 3.25 steps each" in capsys.readouterr().out
+    chunks = fj.event_tensors(open_recording(path), events=250, chunk=1)
+    tensors = np.concatenate([tensors for tensors, _ in chunks])
+    seen = np.concatenate([tensors[:4], -tensors[:4][::-1, ..., ::-1], tensors])
+    state = fj.initial_state(1, HEIGHT, WIDTH)
+    made = fj.reconstruct(plain, state, seen)[1][8:, 0]
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert file["events"][:].tolist() == [1000, 1000, 1000, 250]
+        np.testing.assert_allclose(file["images"], made[np.array([3, 7, 11, 12])], atol=1e-5)
+        whole_times = file["times"][:]
+
+    # In one step: where it is asked for, where nothing is remembered, and where windows overlap.
+    chunks = fj.event_tensors(open_recording(path), events=1000, chunk=1)
+    tensors = np.concatenate([tensors for tensors, _ in chunks])
+    choices["warm_up"] = 0
+    for name, choice, recurrent in (
+        ("whole", {"network": Network(whole_windows=True)}, True),
+        ("forgetful", {"network": Network(recurrent=False)}, False),
+        ("overlapping", {"windows": Windows(events=1000, step=1000)}, True),
+    ):
+        run(settings(weights, (path,), tmp_path / f"{name}.h5", **(choices | choice)))
+        assert "steps each" not in capsys.readouterr().out
+        made = fj.reconstruct(plain, state, tensors, recurrent=recurrent)[1][:, 0]
+        with h5py.File(tmp_path / f"{name}.h5") as file:
+            np.testing.assert_array_equal(file["times"], whole_times)
+            np.testing.assert_allclose(file["images"], made, atol=1e-5)
+
+
+def test_the_steps_of_a_dense_window_are_not_in_the_range_of_pictures(tmp_path, weights):
+    """What is black and white in a picture comes of the pictures before it, and of no others."""
+    path = write_recording(tmp_path / "a.txt", 8000)
+    choices = {"windows": Windows(events=1000), "warm_up": 0}
+    run(settings(weights, (path,), tmp_path / "a.h5", **choices))
+    run(settings(weights, (path,), tmp_path / "a", **choices))
+    with h5py.File(tmp_path / "a.h5") as file:
+        images = file["images"][:]
+    greys = fj.display(fj.initial_display_state(1), images[:, None])[1][:, 0]
+    difference = np.abs(pictures_of(tmp_path / "a")[0].astype(int) - np.asarray(greys))
+    assert difference.max() <= 1
+
+
+@pytest.mark.parametrize(
+    "choice, others",
+    [
+        ({"windows": Windows(events=9, step=3)}, {}), ({"times": Times(rate=3.0)}, {}),
+        ({}, {"recurrent": False}),
+    ],
+)  # fmt: skip
+def test_where_windows_are_whole_nobody_asks_for_it(weights, choice, others):
+    network = Network(whole_windows=True, **others)
+    with pytest.raises(SettingsError, match="--whole-windows has no effect beside"):
+        settings(weights, (Path("a.txt"),), Path("out"), network=network, **choice)
+
+
+def test_a_dense_window_is_not_warned_of_unless_it_is_one_step(tmp_path, weights, caplog):
+    path = write_recording(tmp_path / "a.txt", 2000)
+    run(settings(weights, (path,), tmp_path / "parts", windows=Windows(events=1000)))
+    assert not caplog.messages
+    whole = {"windows": Windows(events=1000), "network": Network(whole_windows=True)}
+    run(settings(weights, (path,), tmp_path / "whole", **whole))
+    assert "more than 1.5 smeared ones" in caplog.text
+
+
 @pytest.mark.parametrize("batch", [1, 2, 3])
 @EACH_WAY
 def test_a_batch_gives_what_each_recording_gives_alone(tmp_path, weights, batch):
@@ -180,6 +251,30 @@ def unfinished(weights, recording, output, monkeypatch):
         interrupt_after(patch, 9)
         with pytest.raises(Interrupted):
             run(settings(weights, (recording,), output))
+
+
+def test_a_run_that_is_interrupted_within_a_dense_window_goes_on(tmp_path, weights, monkeypatch):
+    """Five steps a window, four in a chunk."""
+    recording = write_recording(tmp_path / "a.txt", 12000)
+    choices = {"windows": Windows(events=1200)}
+    run(settings(weights, (recording,), tmp_path / "whole", **choices))
+    with monkeypatch.context() as patch:
+        patch.setattr(jobs, "RESUME_EVERY", 0)
+        interrupt_after(patch, 5)
+        with pytest.raises(Interrupted):
+            run(settings(weights, (recording,), tmp_path / "out", **choices))
+    run(settings(weights, (recording,), tmp_path / "out", **choices))
+    expected, actual = pictures_of(tmp_path / "whole"), pictures_of(tmp_path / "out")
+    np.testing.assert_array_equal(actual[0], expected[0])
+    assert actual[1] == expected[1] and len(actual[0]) == 10
+    with pytest.raises(ValueError, match="network.whole_windows was"):
+        with monkeypatch.context() as patch:
+            patch.setattr(jobs, "RESUME_EVERY", 0)
+            interrupt_after(patch, 5)
+            with pytest.raises(Interrupted):
+                run(settings(weights, (recording,), tmp_path / "other", **choices))
+        choices["network"] = Network(whole_windows=True)
+        run(settings(weights, (recording,), tmp_path / "other", **choices))
 
 
 @pytest.mark.parametrize("at, color", [(2, False), (9, False), (9, True), (30, False)])
@@ -357,8 +452,8 @@ def test_a_damaged_recording_does_not_keep_others_from_being_done(
     (tmp_path / "early.txt").write_text(f"{WIDTH} {HEIGHT}\n0.5 1 1 1 1\n")
     whole = jobs.cut
 
-    def cut(recording, *args):
-        for number, window in enumerate(whole(recording, *args)):
+    def cut(recording, *args, **kwargs):
+        for number, window in enumerate(whole(recording, *args, **kwargs)):
             if recording.path.stem == "late" and number == 5:
                 raise RecordingError(f"{recording.path}: damaged")
             yield window

@@ -28,7 +28,7 @@ from tqdm import tqdm
 from firenet_jax.devices import BATCH, REPLICATED, device_mesh, sharding
 from firenet_jax.errors import OutputError, RecordingError, SettingsError, logger
 from firenet_jax.events import Events, Recording, counted
-from firenet_jax.instants import Counts, Grid, Step, steps, warming
+from firenet_jax.instants import Counts, Grid, Step, in_parts, steps, warming
 from firenet_jax.network import Weights
 from firenet_jax.pictures import Display
 from firenet_jax.reconstruction import (
@@ -88,6 +88,7 @@ class Done(NamedTuple):
     job: Job
     pictures: int
     events: int
+    steps: float  # of the network for a window, on average; 1 if none was dense
     slower: float | None  # by how much a video is slower than real time
 
 
@@ -177,6 +178,7 @@ class Chunk(NamedTuple):
     events: Packed
     count: int  # events
     valid: np.ndarray  # (T, B) bool
+    seen: np.ndarray  # (T, B) bool: False for parts of a window before its last
     looks: Looks | None  # None: each is a window, which has an image
     parts: dict[int, Part]  # by slot
     starts: dict[int, Session]  # by slot: a new recording begins here, from this state
@@ -246,7 +248,7 @@ def in_chunks(
         if not running:
             return
         rows, count = [[Events.empty()] * slots for _ in range(length)], 0
-        valid = np.zeros((length, slots), bool)
+        valid, seen = np.zeros((length, slots), bool), np.ones((length, slots), bool)
         parts: dict[int, Part] = {}
         taken: list[list[Step]] = [[] for _ in range(slots)]
         for slot, one in list(running.items()):
@@ -259,10 +261,10 @@ def in_chunks(
                 if not way.at_times or step.time is None
             )
             for t, step in enumerate(taken[slot]):
-                rows[t][slot] = step.events
+                rows[t][slot], seen[t, slot] = step.events, not step.later
             valid[: len(taken[slot]), slot] = True
             times = [step.time for step in taken[slot]]
-            sizes = [len(step.events) for step in taken[slot]]
+            sizes = [step.earlier + len(step.events) for step in taken[slot]]
             ends = one.ahead is None
             parts[slot] = Part(one, times, sizes, one.reached, one.pictures, ends)
             if ends:
@@ -270,7 +272,7 @@ def in_chunks(
         events = pack_for_devices(rows, devices, size)
         size = len(events.t) // devices
         looks = looks_of(taken, length) if way.at_times else None
-        yield Chunk(events, count, valid, looks, parts, starts)
+        yield Chunk(events, count, valid, seen, looks, parts, starts)
 
 
 def chunk_for(pixels: int) -> int:
@@ -287,10 +289,14 @@ def start(job: Job, way: Way, opened: dict[Path, Writer]) -> tuple[Running, Sess
     writer = opened[job.output] = job.writer()
     running = Running(job, writer)
     try:
-        windows = cut(job.recording, job.windows, running.counting(job.events()))
-        first, windows = warming(windows, job.recording.pixels, job.warm_up)
+        whole, pixels = not splits(job, way), job.recording.pixels
+        windows = cut(job.recording, job.windows, running.counting(job.events()), whole=whole)
+        first, windows = warming(windows, pixels, job.warm_up)
         if job.times is None:
             entries = (Step(window.events, window.time, 1.0) for window in windows)
+            if not whole:
+                first = [part for step in first for part in in_parts(step, pixels)]
+                entries = (part for step in entries for part in in_parts(step, pixels))
         else:
             running.counts, times = Counts(), copy.copy(job.times)  # a grid counts on
             entries = steps(job.recording, job.windows, times, windows, running.counts)
@@ -311,6 +317,19 @@ def start(job: Job, way: Way, opened: dict[Path, Writer]) -> tuple[Running, Sess
     if running.reached and isinstance(writer, FolderWriter):
         writer.keep(running.pictures)
     return running, session
+
+
+def splits(job: Job, way: Way) -> bool:
+    """Whether dense windows are taken in parts: not if a step is to remember nothing, if windows
+    overlap, as their events would come again, or if they only update the state, as they are then
+    chosen for that alone."""
+    network = way.network
+    return (
+        network.recurrent
+        and not network.whole_windows
+        and job.times is None
+        and job.windows.step is None
+    )
 
 
 def lasting(recording: Recording) -> str:
@@ -372,9 +391,9 @@ def computed(
                 lambda a, spec: jax.device_put(a, sharding(spec, mesh)), events, PACKED_SPECS
             )
         session, shown = events_to_pictures(
-            weights, session, events, chunk.valid, chunk.looks, height=height, width=width,
-            network=way.network, settings=way.display, preview=way.preview, rotated=way.rotated,
-            raw=way.raw, mesh=mesh,
+            weights, session, events, chunk.valid, chunk.looks, chunk.seen, height=height,
+            width=width, network=way.network, settings=way.display, preview=way.preview,
+            rotated=way.rotated, raw=way.raw, mesh=mesh,
         )  # fmt: skip
         states = {}
         if time.monotonic() - kept > RESUME_EVERY:
@@ -445,4 +464,6 @@ def finish(running: Running, way: Way, outcome: Outcome) -> None:
     noted = partial(resume.mark_done, output, running.job.record)
     writer.finish(noted if way.several else no_note)
     slower = writer.slower if isinstance(writer, VideoWriter) else None
-    outcome.done[output] = Done(running.job, running.written, running.events, slower)
+    own = running.reached - running.warming
+    each = own / max(running.pictures, 1) if running.job.times is None else 1.0
+    outcome.done[output] = Done(running.job, running.written, running.events, each, slower)
