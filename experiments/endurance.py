@@ -11,7 +11,8 @@ given, ours=PATH. The questions, each a function, an entry of results/endurance.
                 and where does the image drift?
     palindrome  a recording forward and backward, 40 times: all that was seen comes back, so the
                 image should be the same each time.
-    density     the same scenes cut into windows of .03 to 3 events per pixel.
+    density     the same scenes cut into windows of .03 to 3 events per pixel; dense ones are
+                also taken in several steps, as `firenet reconstruct` does.
     light       cameras that move or stand still, in steady light and in that of a lamp that
                 flickers, at .35 events per pixel and at most 40 ms a window, as in `firenet
                 reconstruct`.
@@ -51,12 +52,12 @@ from firenet_jax.commands.simulate import Simulate
 from firenet_jax.commands.simulate import run as make_events
 from firenet_jax.evaluation import metrics
 from firenet_jax.evaluation.equalise import equalise
-from firenet_jax.instants import WARM_UP
+from firenet_jax.instants import PART, WARM_UP
 from firenet_jax.network import State, Weights, initial_state
 from firenet_jax.reconstruction import reconstruct
 from firenet_jax.simulation.curricula import random_setups, window_bounds
-from firenet_jax.simulation.scenes import SceneSettings, render
-from firenet_jax.simulation.sensor import FAULTY, SensorSettings, first_state
+from firenet_jax.simulation.scenes import Scene, SceneSettings, render
+from firenet_jax.simulation.sensor import FAULTY, Sensor, SensorSettings, first_state
 from firenet_jax.simulation.sensor import step as sensor_step
 from firenet_jax.simulation.sequences import simulate
 from firenet_jax.simulation.textures import HELD_OUT, load_textures, photographs
@@ -73,6 +74,7 @@ MOST = 40  # windows of a palindrome
 DENSITIES = (0.03, 0.1, 0.35, 1.0, 3.0)
 SPEEDS = {"slow": (5.0, 50.0), "fast": (200.0, 1000.0)}
 WARM, JUDGED = 30, 10  # windows of a sequence of one density
+TOGETHER = 20  # of them at a time
 FLICKER = (0.1, 0.9)
 USUAL, LONGEST = 0.35, 40_000.0  # events per pixel, microseconds: windows of `firenet reconstruct`
 PIXELS = 40.0  # by which a window of a density moves, at most: one for each rendering
@@ -229,11 +231,13 @@ def _scored(
     sensor: SensorSettings,
     wanted: float,
     longest: float = math.inf,
+    steps: int = 1,
 ) -> dict[str, list[dict]]:
     """Scores of the last windows of sequences in which `wanted` events per pixel make a window, and
     by how many pixels the fastest point moves in one.
 
-    longest: microseconds of a window at most.
+    longest: microseconds of a window at most. steps: in which a window is taken, in equal times;
+    scored is the image of the last.
     """
     pictures = textures()
     windows = WARM + JUDGED
@@ -249,25 +253,46 @@ def _scored(
         durations = jnp.clip(durations * wanted / jnp.maximum(rate, 1e-6), 200, most)
         moved = np.asarray(1e-6 * durations * scenes.speed)
         bounds = window_bounds(durations.astype(jnp.int32), windows)
-        data = simulate(sensors, scenes, bounds, renderings=round(PIXELS), **SIZE)[1]
-        truths = np.asarray(data.images[WARM:])
-        for name, weights in methods.items():
-            state = initial_state(BATCH, *SIZE.values())
-            images = np.asarray(reconstruct(weights, state, data.tensors)[1])
-            rows = scores(images[WARM:], truths, equalised=True)
+        made, truths = _in_steps(methods, sensors, scenes, bounds, steps)
+        for name, images in made.items():
+            rows = scores(images[WARM:], truths[WARM:], equalised=True)
             found[name] += [row | {"pixels": float(p)} for row, p in zip(rows, moved, strict=True)]
     return found
 
 
+def _in_steps(
+    methods: Methods, sensors: Sensor, scenes: Scene, bounds: jax.Array, steps: int
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """(T + 1, B) bounds of windows -> (images by method, truths), (T, B, H, W), at their ends; each
+    window is taken in so many steps."""
+    share = jnp.arange(steps, dtype=jnp.int32)[None, :, None]
+    starts = bounds[:-1, None] + (bounds[1:] - bounds[:-1])[:, None] * share // steps
+    edges = jnp.concatenate([starts.reshape(-1, bounds.shape[1]), bounds[-1:]])
+    made, truths = {name: [] for name in methods}, []
+    states = {name: initial_state(BATCH, *SIZE.values()) for name in methods}
+    seen, chunk = None, TOGETHER * steps
+    for first in range(0, len(edges) - 1, chunk):
+        part = edges[first : first + chunk + 1]
+        seen, data = simulate(
+            sensors, scenes, part, seen, renderings=math.ceil(PIXELS / steps), **SIZE
+        )
+        truths.append(np.asarray(data.images[steps - 1 :: steps]))
+        for name, weights in methods.items():
+            states[name], images = reconstruct(weights, states[name], data.tensors)
+            made[name].append(np.asarray(images[steps - 1 :: steps]))
+    return {name: np.concatenate(images) for name, images in made.items()}, np.concatenate(truths)
+
+
 def density(methods: Methods, sequences: int) -> list[dict]:
+    """Dense windows in one step, and in several, as `firenet reconstruct` takes them."""
     rows = []
     for sensor, speed in itertools.product(SENSORS, SPEEDS):
         scene = SceneSettings(speed=SPEEDS[speed], pause=0.0)
         for wanted in DENSITIES:
-            found = _scored(methods, sequences, scene, SENSORS[sensor], wanted)
-            for name in methods:
-                labels = {"sensor": sensor, "speed": speed, "density": wanted, "weights": name}
-                rows.append(labels | means(found[name]))
+            for steps in sorted({1, max(1, round(wanted / PART))}):
+                found = _scored(methods, sequences, scene, SENSORS[sensor], wanted, steps=steps)
+                labels = {"sensor": sensor, "speed": speed, "density": wanted, "steps": steps}
+                rows += [labels | {"weights": name} | means(found[name]) for name in methods]
     return rows
 
 

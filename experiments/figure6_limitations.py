@@ -4,7 +4,8 @@ Questions: (a) after how many windows is an image from a zero state as good as o
 has seen more, and how much of that does the warm-up of `firenet reconstruct` give? The same windows
 (0.35 events per pixel) are reconstructed from their beginning, after the warm-up, which shows the
 first 20 of them forwards and backwards, and with as many windows before them. (b) How much do 50 ms
-windows smear a fast scene that 5 ms windows show sharply, and do they in a slow one? Errors are
+windows smear a fast scene that 5 ms windows show sharply, and do they in a slow one, if each is one
+step, and if dense ones are several, as in `firenet reconstruct`? Errors are
 those at the ends of the long windows of the second half; the picture is that of the busiest of
 these. MSE and SSIM after local histogram equalisation, means over 6 sequences. All data is
 simulated, because errors need the truth at each window's end.
@@ -35,7 +36,7 @@ from harness import save
 from matplotlib.figure import Figure
 
 from firenet_jax.evaluation.methods import Method
-from firenet_jax.instants import warming
+from firenet_jax.instants import PART, Step, in_parts, warming
 from firenet_jax.windows import Window, Windows
 
 COLOURS = {
@@ -46,6 +47,7 @@ COLOURS = {
 MOST = 40  # windows after the start
 SHOWN = (1, 2, 4, 8, 16, 40)
 LONG, SHORT = 50.0, 5.0  # milliseconds
+WAYS = f"{LONG:.0f} ms in one step", f"{LONG:.0f} ms in steps", f"{SHORT:.0f} ms"
 STARTING = 400.0  # pixels per second: some 80 windows in 1.5 s
 SPEEDS = (50.0, 600.0, 1500.0)  # pixels per second
 
@@ -105,41 +107,46 @@ def smearing(method: Method, options) -> tuple[list[dict], list]:
     """Numbers for each speed and kind of window, and a row of pictures for each speed."""
     numbers, rows = [], []
     for speed in SPEEDS:
-        found = {LONG: [], SHORT: []}
+        found = {way: [] for way in WAYS}
         for k in range(options.sequences):
             sequence = simulated("smearing", options.seed + k, speed=speed, seconds=options.seconds)
-            windows, made = both_windows(method, sequence)
+            windows, made = each_way(method, sequence)
             half = len(windows) // 2
             windows = windows[half:]
-            made = {duration: shown[half:] for duration, shown in made.items()}
+            made = {way: shown[half:] for way, shown in made.items()}
             truths = [sequence.truth(window.time) for window in windows]
-            for duration, shown in made.items():
-                found[duration] += [errors(*pair) for pair in zip(shown, truths, strict=True)]
+            for way, shown in made.items():
+                found[way] += [errors(*pair) for pair in zip(shown, truths, strict=True)]
             if k == 0:
                 busiest = max(range(len(windows)), key=lambda n: len(windows[n].events))
-                shown = [made[LONG][busiest], made[SHORT][busiest], truths[busiest]]
+                shown = [*(made[way][busiest] for way in WAYS), truths[busiest]]
                 cells = [event_picture(windows[busiest], sequence.recording)]
                 cells += [picture(image, "none") for image in shown]
                 rows.append((f"at most {speed:,.0f} pixels per second", cells))
-        for duration, each in found.items():
+        for way, each in found.items():
             means = {key: float(np.mean([row[key] for row in each])) for key in each[0]}
-            numbers.append({"speed": speed, "window_ms": duration, **means})
-            print(f"{speed:5.0f} pixels/s, windows of {duration:2.0f} ms: MSE {means['mse']:.3f} "
+            numbers.append({"speed": speed, "windows": way, **means})
+            print(f"{speed:5.0f} pixels/s, windows of {way}: MSE {means['mse']:.3f} "
                   f"SSIM {means['ssim']:.3f}")  # fmt: skip
     return numbers, rows
 
 
-def both_windows(method: Method, sequence: Sequence) -> tuple[list[Window], dict]:
-    """The long windows, and the images at their ends that each kind of windows gives."""
+def each_way(method: Method, sequence: Sequence) -> tuple[list[Window], dict]:
+    """The long windows, and the images at their ends that each of `WAYS` gives."""
     ratio = round(LONG / SHORT)
     long = windows_of(sequence, Windows(duration=LONG))
     # grids of both begin at the first event, so every tenth short window ends a long one
     short = windows_of(sequence, Windows(duration=SHORT))[: ratio * len(long)]
     recording = sequence.recording
-    return long, {
-        LONG: list(images(method, long, recording)),
-        SHORT: list(images(method, short, recording))[ratio - 1 :: ratio],
-    }
+    steps = [
+        step for each in long for step in in_parts(Step(each.events, each.time, 1.0),
+                                                   recording.pixels)
+    ]  # fmt: skip
+    parts = images(method, [Window(step.events, step.time or 0) for step in steps], recording)
+    ends = [image for step, image in zip(steps, parts, strict=True) if not step.later]
+    whole = list(images(method, long, recording))
+    brief = list(images(method, short, recording))[ratio - 1 :: ratio]
+    return long, dict(zip(WAYS, (whole, ends, brief), strict=True))
 
 
 def main():
@@ -162,12 +169,12 @@ def main():
         f"means over {options.sequences} sequences.",
     )
     numbers, pictures = smearing(method, options)
-    titles = [f"events of {LONG:.0f} ms", f"windows of {LONG:.0f} ms", f"of {SHORT:.0f} ms"]
+    titles = [f"events of {LONG:.0f} ms", *(f"windows of {way}" for way in WAYS)]
     save_figure(
         options.out / "figure6_smearing.jpg",
         [grid([*titles, "truth"], pictures)],
-        f"{data} Both kinds of windows end at the same time; pictures as they are, those of the "
-        "busiest long window.",
+        f"{data} All end at the same time; pictures as they are, those of the busiest long window. "
+        f"In steps: of about {PART} events per pixel, as in firenet reconstruct.",
     )
     save(
         "figure6_limitations",

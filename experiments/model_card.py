@@ -19,7 +19,7 @@ TWICE = ("e2vid_slider_depth.zip", "ros2_event_camera_msgs")  # another format o
 BETTER = {"ssim": 1, "ssim_equalised": 1, "mse": -1, "mse_equalised": -1, "temporal": -1}
 LABELS = {  # of the rows that are compared
     "long": ("sensor", "windows"),
-    "density": ("sensor", "speed", "density"),
+    "density": ("sensor", "speed", "density", "steps"),
     "light": ("camera", "light"),
     "clip": ("recording",),
     "frames": ("recording", "warm_up"),
@@ -57,12 +57,15 @@ def long(shipped: dict, endurance: dict) -> list[list[str]]:
 
 
 def density(shipped: dict, endurance: dict) -> list[list[str]]:
+    """As `firenet reconstruct` takes windows; then dense ones in one step."""
     rows = [row for row in endurance["density"] if row["speed"] == "slow"]
+    most = {row["density"]: max(r["steps"] for r in rows if r["density"] == row["density"])
+            for row in rows}  # fmt: skip
     return [
         [sensor, NAMES[name]]
         + [
             f"{row['ssim']:.3f}, {row['ssim_equalised']:.3f}"
-            for row in sorted(rows, key=lambda row: row["density"])
+            for row in sorted(rows, key=lambda r: (r["steps"] < most[r["density"]], r["density"]))
             if (row["sensor"], row["weights"]) == (sensor, name)
         ]
         for sensor in ("clean", "faulty")

@@ -97,6 +97,7 @@ def test_they_become_tensors():
         ({"width": 0}, "width is 0"), ({"height": 20.5}, "height is 20.5"),
         ({"width": float("nan")}, "width is nan"), ({"height": "20"}, "height is '20', but"),
         ({"width": 10**6}, "width is 1000000, but is a number of pixels, at most 32768"),
+        ({"width": 2**13, "height": 2**12}, "8192x4096 pixels, expected at most 16,777,216"),
         ({"x": None, "y": None, "p": None}, "pass t, x, y and p, or one structured array"),
         ({"x": None}, "pass t, x, y and p"),
         ({"t": np.ma.masked_array(T, [0, 1, 0, 0])}, "some entries are masked"),

@@ -27,7 +27,7 @@ from firenet_jax.commands.times import Times
 from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.network import Weights, initial_params
 from firenet_jax.pictures import Display
-from firenet_jax.readers import open_recording
+from firenet_jax.readers import open_recording, text
 from firenet_jax.reconstruction import Network
 from firenet_jax.storage.arrays import ArraysWriter
 from firenet_jax.storage.files import OutputError, locked, read_arrays
@@ -348,9 +348,12 @@ def test_what_an_interrupted_run_left_is_named_where_it_is_damaged(tmp_path, wei
     assert len(pictures_of(tmp_path / "out")[0]) == 30
 
 
+@pytest.mark.parametrize("block", [text.BLOCK, 1000])
 def test_a_run_that_goes_on_counts_the_events_of_its_own_pictures(
-    tmp_path, weights, monkeypatch, capsys
+    tmp_path, weights, monkeypatch, capsys, block
 ):
+    """The warm-up reads ahead of them: the recording as a whole, or its first part."""
+    monkeypatch.setattr(text, "BLOCK", block)
     recording = write_recording(tmp_path / "a.txt")
     unfinished(weights, recording, tmp_path / "out", monkeypatch)
     capsys.readouterr()

@@ -1116,6 +1116,10 @@ def test_evt3_words():
         assert decoded(words[:cut], words[cut:]) == expected
     assert decoded(*([word] for word in words)) == expected
     assert decoded([]) == []
+    # Where a vector goes on does not depend on whether anything was told of the one before it.
+    words = [row(7), base(5, 1), 0x4FFF, high(1), low(2), 0x4001]
+    for cut in range(len(words) + 1):
+        assert decoded(words[:cut], words[cut:]) == [(4096 + 2, 17, 7, 1)]
 
 
 def test_evt3_time():
@@ -2071,6 +2075,22 @@ def test_single_bad_rows_are_left_out_and_said_once(tmp_path, caplog):
     assert "events.txt, line 7: time runs backwards, from 40 to 30 us" in caplog.text
     assert "left out: 11 of 19,999 events (--strict refuses that)" in caplog.text  # one is empty
     refused(path, "line 7: time runs backwards", size=None)
+
+
+def test_bad_rows_among_lines_that_end_as_they_did_on_old_macs(tmp_path):
+    rows = [f"{i * 1e-3:.6f} {i % 20} 3 1" for i in range(3000)]
+    rows[1500] = "1.5 40000 3 1"
+    path = write(tmp_path / "events.txt", "\r".join(rows) + "\n")
+    assert len(events_of(path, None)) == 2999
+
+
+def test_a_header_that_hides_the_first_row_is_refused(tmp_path):
+    """Of these rows the times would be seconds, and the size that of the events."""
+    rows = "64 48\n" + "".join(f"{i * 1000} {i % 20} 3 1\n" for i in range(100))
+    path = write(tmp_path / "events.txt", "# " + "c" * 60_000 + "\n" + rows)
+    assert events_of(path, None).t[-1] == 99_000
+    for comment in ("# " + "c" * 70_000 + "\n", "# a line of a comment\n" * 4000):
+        refused(write(path, comment + rows), "first 65,536 bytes are comments", size=None)
 
 
 def test_as_few_as_possible_are_left_out_for_the_order_of_time():

@@ -634,7 +634,7 @@ def test_bandwidth_lets_slow_changes_pass_and_holds_fast_ones_back():
 
 
 @pytest.mark.parametrize(
-    "before, light, dark", [(0.05, 0.3, 0.2), (0.9, 0.0, 0.1), (0.1, 1.0, 0.5)]
+    "before, light, dark", [(0.05, 0.3, 0.2), (0.9, 0.0, 0.1), (0.1, 1.0, 0.5), (0.9, 0.0, 0.0)]
 )
 def test_bandwidth_grows_with_light(before, light, dark):
     """From what it is in the dark to 100 Hz; what is left of a step falls exponentially."""

@@ -83,6 +83,7 @@ def test_two_runs_do_not_write_the_same_output(tmp_path, name):
         ([], "no pictures"),
         ([np.zeros((8, 8), np.float32)], "picture 1 is float32"),
         ([np.zeros((8, 8), bool)], "picture 1 is bool"),
+        ([np.zeros((0, 8), np.uint8)], "picture 1 is uint8 of the shape .0, 8"),
         ([np.zeros((8, 8, 4), np.uint8)], "picture 1 is uint8 of the shape .8, 8, 4"),
         ([np.zeros((8, 8), np.uint8), np.zeros((8, 9), np.uint8)], "picture 2 is"),
     ],

@@ -113,7 +113,7 @@ class Running:
     reached: int = 0  # steps taken so far, those of an earlier run among them
     pictures: int = 0  # of these
     events: int = 0  # read so far, by this run
-    chunk: Events = field(default_factory=Events.empty)  # the last of them
+    read: deque[Events] | None = field(default_factory=deque)  # of them; None once `skip` is done
     written: int = 0  # pictures, by this run
     counts: Counts | None = None  # of times at which images are wanted
     error: RecordingError | None = None  # that ended its steps before their time
@@ -122,16 +122,21 @@ class Running:
     def counting(self, chunks: Iterator[Events]) -> Iterator[Events]:
         for chunk in chunks:
             self.events += len(chunk)
-            self.chunk = chunk
+            if self.read is not None:
+                self.read.append(chunk)
             yield chunk
 
     def skip(self, count: int) -> None:
         """Passes over so many steps, whose events do not count."""
-        last = None
-        for step in itertools.islice(self.steps, count):
-            last = int(step.events.t[-1]) if len(step.events) else last
-        if last is not None:  # what has been read is at most a chunk ahead
-            self.events = int((self.chunk.t > last).sum())
+        last, read = None, self.read or deque()
+        for number, step in enumerate(itertools.islice(self.steps, count)):
+            if number >= self.warming and len(step.events):  # the warm-up runs backwards, too
+                last = int(step.events.t[-1])
+                while read and read[0].t[-1] <= last:
+                    read.popleft()
+        if last is not None:
+            self.events = sum(int((chunk.t > last).sum()) for chunk in read)
+        self.read = None
 
     def take(self, count: int) -> list[Step]:
         """The next `count` steps, or as many as there are."""

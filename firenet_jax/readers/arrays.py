@@ -9,7 +9,7 @@ from firenet_jax.errors import RecordingError
 from firenet_jax.events import MAX_TIME, Recording, checked
 from firenet_jax.readers import in_chunks
 from firenet_jax.readers.text import NAMES, warn_of_coarse_times, warn_of_whole_seconds
-from firenet_jax.settings import LONGEST_SIDE
+from firenet_jax.settings import LONGEST_SIDE, MOST_PIXELS
 
 UNITS = {"s": None, "ms": 1000, "us": 1}  # in microseconds; seconds become float64
 
@@ -51,6 +51,10 @@ def recording(
             raise RecordingError(
                 f"{name}: {side} is {value!r}, but is a number of pixels, at most {LONGEST_SIDE}"
             )
+    if width * height > MOST_PIXELS:
+        raise RecordingError(
+            f"{name}: a sensor of {width}x{height} pixels, expected at most {MOST_PIXELS:,}"
+        )
     if unit not in (None, *UNITS):
         raise RecordingError(f"{name}: unit is {unit!r}, expected one of {', '.join(UNITS)}")
     columns["t"] = _in_unit(name, columns["t"], unit)

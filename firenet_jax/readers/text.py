@@ -57,6 +57,7 @@ UNITS = {  # microseconds in a unit: its names
 Named = tuple[tuple[str, ...], float | None]  # columns and unit, as in `Layout`
 LOGICAL = ("False", "FALSE", "false", "True", "TRUE", "true")  # and 0 and 1: pyarrow's
 SIDE = re.compile(r"\d{1,9}", re.ASCII)
+ENDS = re.compile(rb"\r\n?|\n")  # of lines, as pyarrow has it
 WORDS = "no one two three four five six seven eight nine ten".split()
 EXPECTED = {
     "t": ("the time", "a number of seconds"),
@@ -133,12 +134,21 @@ def _only_text(path: Path) -> str:
     return texts[0]
 
 
-def _sniff(path: Path, member: str | None, columns: str | None = None) -> Layout:
+def _first_lines(path: Path, member: str | None) -> list[str]:
     with opened(path, member) as stream:
         head = next(_pieces(stream, HEAD), b"")
     lines = head.decode("utf-8-sig", "replace").split("\n")
     if len(head) == HEAD:
+        if all(line.strip()[:1] in ("", "#", "%") for line in lines):
+            raise RecordingError(
+                f"{path}: its first {HEAD:,} bytes are comments: shorten them, if events follow"
+            )
         lines.pop()  # cut off
+    return lines
+
+
+def _sniff(path: Path, member: str | None, columns: str | None = None) -> Layout:
+    lines = _first_lines(path, member)
     size, names, unit, skip = None, ("t", "x", "y", "p"), None, len(lines)
     told = columns is not None
     if columns is not None and (named := _names(columns.lower())):
@@ -422,7 +432,8 @@ def _sorted_out(
 ) -> Rows:
     """A block with lines that are no events -> Rows, line by line in Python, which is slow."""
     good, bad, first_fault = [], [], ""
-    for line in filter(None, map(str.strip, block.decode("utf-8", "replace").split("\n"))):
+    text = ENDS.sub(b"\n", block).decode("utf-8", "replace")
+    for line in filter(None, map(str.strip, text.split("\n"))):
         fault = _fault(line, layout)
         if fault and not first_fault:
             first_fault = f"{path}, {place(len(bad))}: {fault}"
@@ -488,7 +499,7 @@ def _shown(line: str) -> str:
 
 def _filled(block: bytes) -> list[int]:
     """The lines of a block that are not empty: pyarrow's rows."""
-    return [i for i, line in enumerate(block.split(b"\n")) if line.strip()]
+    return [i for i, line in enumerate(ENDS.split(block)) if line.strip()]
 
 
 def _line(number: int, block: bytes, row: int) -> str:

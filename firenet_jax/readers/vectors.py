@@ -32,6 +32,7 @@ def expand(
     moved = np.cumsum(width)
     moved -= np.append(0, moved[sets])[latest]  # since the base was set, this word included
 
+    end = moved[-1] if moved.size else 0
     words = np.flatnonzero(known & (single | (width > 0) & (starts[latest] >= 0)))
     load, single, latest, width = load[words], single[words], latest[words], width[words]
     vector = np.flatnonzero(~single)
@@ -45,5 +46,5 @@ def expand(
     bit = np.zeros(word.shape, int)
     bit[~single[word]] = np.flatnonzero(bits) & 15
 
-    place = starts[-1] + (moved[-1] if load.size and starts[-1] >= 0 else 0)
+    place = starts[-1] + (end if starts[-1] >= 0 else 0)
     return Base(int(place), int(polarities[-1])), (words[word], first[word] + bit, on[word])

@@ -428,7 +428,8 @@ def _low_pass(cutoff, seen: jax.Array, log: jax.Array, lit: jax.Array, seconds) 
     hertz, dark = cutoff
     a = seconds * 2 * jnp.pi * hertz * (dark + (1 - dark) * lit)
     reached = -jnp.expm1(-a)  # of where L was at the beginning
-    lag = reached / jnp.maximum(a, 1e-12)  # of what it rises by: an a-th of that in the long run
+    # Of what it rises by: an a-th of that in the long run, all of it where nothing gets through.
+    lag = jnp.where(a > 0, reached / jnp.where(a > 0, a, 1.0), 1.0)
     return (1 - lag) * (log_intensity(lit) - seen) + reached * (seen - log)
 
 

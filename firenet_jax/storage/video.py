@@ -452,7 +452,7 @@ def write_video(path: str | Path, pictures: Iterable[np.ndarray], fps: float = 3
         for number, picture in enumerate(map(np.asarray, pictures)):
             shape = shape or picture.shape
             kind = picture.ndim == 2 or picture.shape[2:] == (3,)
-            if not (kind and picture.dtype == np.uint8 and picture.shape == shape):
+            if not (kind and picture.size and picture.dtype == np.uint8 and picture.shape == shape):
                 raise ValueError(
                     f"picture {number + 1} is {picture.dtype} of the shape {picture.shape}, "
                     "expected uint8 (H, W) or (H, W, 3), all of one size"
