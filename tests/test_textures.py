@@ -104,6 +104,9 @@ def test_fractions_are_refused_by_name(tmp_path, caplog):
 def test_folders_that_cannot_be_used(tmp_path):
     with pytest.raises(ValueError, match="no such folder"):
         load_textures(tmp_path / "nowhere")
+    (tmp_path / "notes.txt").write_text("")
+    with pytest.raises(ValueError, match="notes.txt: is a file: name a folder"):
+        load_textures(tmp_path / "notes.txt")
     with pytest.raises(ValueError, match="holds no pictures"):
         load_textures(tmp_path)
     picture(tmp_path / "small.png", 20, 30)

@@ -591,6 +591,59 @@ def test_a_run_resumes_on_the_files_that_it_began_with(tmp_path, ending):
         train._check_folder(asked.output, asked)
 
 
+@pytest.mark.parametrize("ending", ["h5", "png"])
+def test_a_run_knows_its_files_in_another_place(tmp_path, monkeypatch, ending):
+    """And however that is spelt; another set is another one."""
+    for name in ("set", "other"):
+        (tmp_path / name / "train").mkdir(parents=True)
+        (tmp_path / name / f"train/a.{ending}").write_bytes(name.encode())
+    monkeypatch.chdir(tmp_path)
+    name = {"h5": "data", "png": "images"}[ending]
+
+    def asked(place):
+        return tiny(tmp_path / "run", **{name: (Path(place),) if ending == "h5" else Path(place)})
+
+    begun(tmp_path / "run", asked("set"))
+    for place in (tmp_path / "set", "../" + tmp_path.name + "/set"):
+        train._check_folder(tmp_path / "run", asked(place))
+    (tmp_path / "set").rename(tmp_path / "moved")
+    train._check_folder(tmp_path / "run", asked("moved"))
+    with pytest.raises(OutputError, match=f"other settings .{name} was"):
+        train._check_folder(tmp_path / "run", asked("other"))
+
+
+def test_a_run_knows_its_recordings_and_weights_in_another_place(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_weights(Path("w.npz"), Weights(initial_params(jax.random.key(0)), normalise=True))
+    Path("a.aedat4").write_bytes(b"")
+    there = {"data": (Path("a.aedat4"),), "weights": Path("w.npz")}
+    begun(Path("run"), tiny(Path("run"), **there))
+    here = {"data": (tmp_path / "a.aedat4",), "weights": tmp_path / "w.npz"}
+    train._check_folder(tmp_path / "run", tiny(tmp_path / "run", **here))
+    other = here | {"data": (tmp_path / "b.aedat4",)}
+    with pytest.raises(OutputError, match="other settings .data was"):
+        train._check_folder(tmp_path / "run", tiny(tmp_path / "run", **other))
+
+
+@pytest.mark.parametrize(
+    "choice, said",
+    [
+        ({"images": "typo"}, "typo: no such folder"),
+        ({"data": ("empty",)}, "empty: holds no .h5"), ({"data": ("one",)}, "two files or more"),
+    ],
+)  # fmt: skip
+def test_what_is_not_there_is_said_before_all_else(tmp_path, monkeypatch, choice, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one/a.h5").write_bytes(b"")
+    monkeypatch.setattr(train_settings, "is_set", lambda path: True)
+    choice = {key: Path(v) if key == "images" else (Path(v[0]),) for key, v in choice.items()}
+    with pytest.raises(FirenetError, match=said):
+        run(tiny(tmp_path / "run", **choice))
+    assert not (tmp_path / "run").exists()
+
+
 def test_the_log_of_a_run_killed_as_it_goes_on_is_still_there(tmp_path, monkeypatch):
     Log(tmp_path, 0).write(1, "validation", {"loss": jnp.float32(3)})
 
@@ -777,12 +830,31 @@ def test_a_run_whose_newest_checkpoint_is_damaged_goes_on_from_the_one_before(tm
     for path in newest.rglob("*"):
         if path.is_file():
             path.write_bytes(b"")
-    with pytest.raises(CheckpointError, match=f"{newest} is damaged .*: remove it, and the run go"):
+    said = f"{newest} is damaged .*: remove it, and the run goes on after step 2"
+    with pytest.raises(CheckpointError, match=said):
         run(tiny(tmp_path))
     shutil.rmtree(newest)
     run(tiny(tmp_path), stop=4)
     assert steps_of(tmp_path) == [1, 2, 3, 4]
     assert load_weights(tmp_path / "last.npz").params["head"]["bias"][0] == 4
+
+
+def test_a_run_without_a_checkpoint_does_not_lose_what_it_made(tmp_path, scores):
+    """One is damaged; or all are gone."""
+    run(tiny(tmp_path, save_every=1e9, validate_every=1), stop=3)
+    only, made = tmp_path / "checkpoints/3", (tmp_path / "weights.npz").read_bytes()
+    log = (tmp_path / "log.jsonl").read_bytes()
+    for path in only.rglob("*"):
+        if path.is_file():
+            path.write_bytes(b"")
+    with pytest.raises(CheckpointError, match="damaged .*: it is the only one: choose another --o"):
+        run(tiny(tmp_path))
+    shutil.rmtree(only)
+    for choices in ({}, {"save_every": 1e9}):
+        with pytest.raises(OutputError, match="holds weights.npz, but no checkpoint to go on from"):
+            run(tiny(tmp_path, validate_every=1, **choices))
+    assert (tmp_path / "weights.npz").read_bytes() == made
+    assert (tmp_path / "log.jsonl").read_bytes() == log
 
 
 def test_a_run_that_goes_on_keeps_weights_that_did_better_before(tmp_path, scores):

@@ -41,7 +41,7 @@ from firenet_jax.simulation.sensor import (
     random_sensor,
     with_faults,
 )
-from firenet_jax.simulation.textures import load_textures
+from firenet_jax.simulation.textures import load_textures, pictures_in
 from firenet_jax.storage import runs
 from firenet_jax.storage.files import (
     check_apart,
@@ -94,9 +94,9 @@ class Simulate:
     sensor_size: str | None = None
     """WIDTHxHEIGHT (default: 240x180, or the size of the video)."""
     images: Path | None = None
-    """Folder of pictures for the textures (the paper used MS-COCO), but for five names that are
-    held out to judge by, such as flower.jpg. Default: scikit-image's photographs, if it is
-    installed, and procedural textures."""
+    """Folder of pictures for the textures, of at least 160 pixels, but for five names that are held
+    out to judge by, such as flower.jpg. Default: scikit-image's photographs, if it is installed,
+    and procedural textures."""
     seed: int = 0
     """Random seed."""
     video: Path | None = None
@@ -160,6 +160,8 @@ def run(settings: Simulate) -> list[Path]:
     if settings.video is not None:  # which processes do not share
         return [] if process else [simulate_clip(settings, settings.video)]
     height, width = parse_size(settings.sensor_size or "240x180")
+    if settings.images is not None:
+        pictures_in(settings.images)  # before there is a folder
     folder = settings.output
     if folder.is_file() or folder.suffix in CLIP_SUFFIXES:
         raise OutputError(f"{folder}: sequences go into a folder: choose another name")

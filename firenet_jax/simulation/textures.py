@@ -75,7 +75,8 @@ def pictures_in(folder: Path) -> list[Path]:
 
     Raises PictureError where there are none."""
     if not folder.is_dir():
-        raise PictureError(f"{folder}: no such folder: name one with pictures in it")
+        found = "is a file" if folder.exists() else "no such folder"
+        raise PictureError(f"{folder}: {found}: name a folder with pictures in it")
     held_out = {name for names in HELD_OUT.values() for name in names}
     found = [path for path in files_in(folder) if path.name.lower().endswith(SUFFIXES)]
     kept = [path for path in found if path.name.lower() not in held_out]

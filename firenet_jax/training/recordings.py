@@ -9,7 +9,7 @@ folder of the run: its beginning to learn from, and its end, held out to judge b
 
 Window t lasts from one frame to the next, as in `training.batches`, and frame t is the truth at its
 end. Afterwards the weights before and after are judged on the held-out ends, as `firenet
-reconstruct --frame-to-frame` shows them: whole images, of a state that is warm.
+reconstruct --frame-to-frame --whole-windows` shows them: whole images, of a state that is warm.
 """
 
 import itertools

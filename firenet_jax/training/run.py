@@ -67,11 +67,7 @@ def run(
     another run writes into the folder.
     """
     join(settings.coordinator, settings.processes, settings.process)
-    if settings.batch % jax.device_count():
-        raise SettingsError(
-            f"batch is {settings.batch}, but the sequences of a batch are shared by "
-            f"{jax.device_count()} devices: choose a multiple of that"
-        )
+    _check_devices_and_data(settings)
     folder = settings.output
     _check_folder(folder, settings)
     state = first_state(_without_what_is_saved(settings))
@@ -83,6 +79,8 @@ def run(
         if saved.latest_step() is not None:
             state = restored(saved, state)
             _say_how_far(folder, int(state.step), settings.steps)
+        else:
+            _check_nothing_is_lost(folder)
         prepare()
         done = begun = int(state.step)
         sources, validation = sources_of(settings, done)
@@ -143,13 +141,19 @@ def restored(saved: ocp.CheckpointManager, state: Any) -> Any:
     Raises CheckpointError for one that is damaged.
     """
     newest = saved.latest_step()
+    before = [step for step in saved.all_steps() if step != newest]
+    way_out = (
+        f"remove it, and the run goes on after step {max(before)}"
+        if before
+        else "it is the only one: choose another --output, with --weights to begin with its weights"
+    )
     try:
         return saved.restore(newest, args=ocp.args.StandardRestore(state))
     except Exception as error:  # damaged bytes raise every kind of orbax, tensorstore and JSON
         reason = " ".join(str(error).split())[:100]
         raise CheckpointError(
             f"{saved.directory / str(newest)} is damaged ({type(error).__name__}: {reason}): "
-            "remove it, and the run goes on after the checkpoint before"
+            + way_out
         ) from error
 
 
@@ -311,6 +315,30 @@ def _initial(settings: Train) -> str | None:
         return None
 
 
+def _check_devices_and_data(settings: Train) -> None:
+    """Raises SettingsError for a batch that devices cannot share, and at once what would be found
+    when all has been made ready: that there are no pictures, or no sequences."""
+    if settings.batch % jax.device_count():
+        raise SettingsError(
+            f"batch is {settings.batch}, but the sequences of a batch are shared by "
+            f"{jax.device_count()} devices: choose a multiple of that"
+        )
+    if settings.images is not None:
+        pictures_in(settings.images)
+    elif settings.data and not settings.on_recordings:
+        split(settings.sequences)
+
+
+def _check_nothing_is_lost(folder: Path) -> None:
+    """Raises OutputError where a run without a checkpoint, which would begin again, has weights."""
+    for name in ("weights.npz", "last.npz"):
+        if (folder / name).exists():
+            raise OutputError(
+                f"{folder} holds {name}, but no checkpoint to go on from: choose another --output, "
+                f"with --weights {folder} to begin with its weights"
+            )
+
+
 def _check_folder(folder: Path, settings: Train) -> None:
     """Makes it, if it is missing. Raises OutputError for a folder of somebody else, or of a run
     with other settings."""
@@ -344,6 +372,7 @@ def _check_settings(folder: Path, found: dict, settings: Train) -> None:
             "%s has changed since the run in %s began, which goes on from its own weights: to "
             "begin with these, choose another --output", settings.weights, folder,
         )  # fmt: skip
+    _forget_places(found, now, settings)
     if found.get("warmup") == 200 and settings.warmup is None:  # of before the default was None
         found["warmup"] = None
     found = runs.completed(found, _record(Train(folder)))
@@ -367,6 +396,24 @@ def _check_settings(folder: Path, found: dict, settings: Train) -> None:
         found, now, f"{folder} holds a run with other settings",
         "choose another --output, or go on with the same settings", but=may_change,
     )  # fmt: skip
+
+
+def _forget_places(found: dict, now: dict, settings: Train) -> None:
+    """The same files and weights are known by what they are, wherever they are and however that is
+    spelt; of recordings, `prepare` sees to their sizes."""
+    if settings.on_recordings:
+        names = [
+            [Path(path).name for path in ([data] if isinstance(data, str) else data or ())]
+            for data in (found.get("data"), now["data"])
+        ]
+        same = names[0] == names[1]
+    else:
+        same = found["files"] is not None and found["files"] == now["files"]
+        same = same and (found.get("data") is None) == (now["data"] is None)
+    if same:
+        found |= {name: now[name] for name in ("data", "images")}
+    if found.get("initial") is not None and found["initial"] == now["initial"]:
+        found["weights"] = now["weights"]
 
 
 def _keep_settings(folder: Path, settings: Train) -> None:

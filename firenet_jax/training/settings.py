@@ -52,8 +52,8 @@ class Train:
     """Instead of simulating: a folder of HDF5 sequences (`firenet simulate`, or a data set), or
     recordings with frames, whose ends are held out."""
     images: Path | None = None
-    """Folder of pictures for textures (default: scikit-image's photographs and procedural
-    textures)."""
+    """Folder of pictures for textures, at least 128 pixels on a side (default: scikit-image's
+    photographs and procedural textures)."""
     textures: int = 256
     """Number of textures."""
     procedural: float = 0.25
