@@ -1219,6 +1219,9 @@ GENTLE = replace(FAITHFUL, steps=687, slow=0.04, learning_rate=1.5e-4, seed=2012
 GENTLER = replace(GENTLE, steps=721, motion=(0.4, 40.0), slow=0.06, seed=2021,
                   loss=replace(GENTLE.loss, l1=3.0),
                   sensor=replace(FINE.sensor, clean=0.35))  # fmt: skip
+# A stage of 75 minutes from LAST_MEAN at three times that rate, on motion of at most ten pixels a
+# window, as denser ones are taken in several steps since, is no better in sparse windows: it is
+# not dense ones that take what a network of this size could do there.
 # The candidate of the second ConvGRU has this share of that of DUSKY, which "vast" began from; the
 # rest is, up to "rapid", that of "vast", and later of the mean itself. More of it remembers better
 # what goes to and fro, and rests less well. FORMER had half.

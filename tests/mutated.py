@@ -349,7 +349,7 @@ def read(name: str, path: Path) -> None:
         textures.load_textures(path.parent, 1, 32, 0)
     elif name == "log.jsonl":
         log = training_log.Log.__new__(training_log.Log)
-        log.entries = [entry for entry in training_log._entries(path) if entry["step"] <= 100]
+        log.entries = [entry for entry in training_log.entries(path) if entry["step"] <= 100]
         f"{log.best():.4f}"
     else:
         recording = open_recording(path)

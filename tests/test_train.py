@@ -585,10 +585,15 @@ def test_a_run_resumes_on_the_files_that_it_began_with(tmp_path, ending):
     (tmp_path / "run/settings.json").write_text(json.dumps(record))
     with pytest.raises(OutputError, match="set has changed since the run in .*run began"):
         train._check_folder(asked.output, asked)
+    (tmp_path / "else").mkdir()
+    elsewhere = {"data": (tmp_path / "else",)} if ending == "h5" else {"images": tmp_path / "else"}
+    (tmp_path / f"else/c.{ending}").write_bytes(b"c")
     without = {name: value for name, value in record.items() if name != "files"}
     for earlier in (without, record | {"files": None}):  # of runs of before they were recorded
         (tmp_path / "run/settings.json").write_text(json.dumps(earlier))
         train._check_folder(asked.output, asked)
+        with pytest.raises(OutputError, match="other settings"):
+            train._check_folder(asked.output, tiny(tmp_path / "run", **elsewhere))
 
 
 @pytest.mark.parametrize("ending", ["h5", "png"])
@@ -850,11 +855,13 @@ def test_a_run_without_a_checkpoint_does_not_lose_what_it_made(tmp_path, scores)
     with pytest.raises(CheckpointError, match="damaged .*: it is the only one: choose another --o"):
         run(tiny(tmp_path))
     shutil.rmtree(only)
-    for choices in ({}, {"save_every": 1e9}):
-        with pytest.raises(OutputError, match="holds weights.npz, but no checkpoint to go on from"):
-            run(tiny(tmp_path, validate_every=1, **choices))
+    with pytest.raises(OutputError, match="holds weights.npz, but no checkpoint to go on from"):
+        run(tiny(tmp_path, validate_every=1))
     assert (tmp_path / "weights.npz").read_bytes() == made
     assert (tmp_path / "log.jsonl").read_bytes() == log
+    # Killed before its first checkpoint was due, it begins again.
+    run(tiny(tmp_path, save_every=1e9, validate_every=1), stop=1)
+    assert steps_of(tmp_path) == [1]
 
 
 def test_a_run_that_goes_on_keeps_weights_that_did_better_before(tmp_path, scores):

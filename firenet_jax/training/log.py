@@ -42,7 +42,7 @@ class Log:
 
     def __init__(self, folder: Path, step: int):
         self.path, self.start = folder / "log.jsonl", time.monotonic()
-        self.entries = [entry for entry in _entries(self.path) if entry["step"] <= step]
+        self.entries = [entry for entry in entries(self.path) if entry["step"] <= step]
         self.board: Any = None
         self.failed: OSError | None = None
         if is_first():
@@ -115,7 +115,7 @@ class Log:
             self.board.file_writer.event_writer._closed = True  # else it tries again at the exit
 
 
-def _entries(path: Path) -> Iterator[dict]:
+def entries(path: Path) -> Iterator[dict]:
     """Lines of a log, but what was half written when a run was killed, and what is no entry."""
     for line in path.read_bytes().splitlines() if path.exists() else []:
         with contextlib.suppress(ValueError, TypeError, RecursionError, OverflowError):

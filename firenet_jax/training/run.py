@@ -40,7 +40,7 @@ from firenet_jax.storage import runs
 from firenet_jax.storage.files import locked, write_text
 from firenet_jax.storage.progress import bar, one_done
 from firenet_jax.training.batches import NO_AUGMENT, batches, find, split
-from firenet_jax.training.log import Log
+from firenet_jax.training.log import Log, entries
 from firenet_jax.training.settings import Train
 from firenet_jax.training.step import (
     TEXTURE,
@@ -80,7 +80,7 @@ def run(
             state = restored(saved, state)
             _say_how_far(folder, int(state.step), settings.steps)
         else:
-            _check_nothing_is_lost(folder)
+            _check_nothing_is_lost(folder, settings)
         prepare()
         done = begun = int(state.step)
         sources, validation = sources_of(settings, done)
@@ -329,10 +329,13 @@ def _check_devices_and_data(settings: Train) -> None:
         split(settings.sequences)
 
 
-def _check_nothing_is_lost(folder: Path) -> None:
-    """Raises OutputError where a run without a checkpoint, which would begin again, has weights."""
+def _check_nothing_is_lost(folder: Path, settings: Train) -> None:
+    """Raises OutputError where a run without a checkpoint, which would begin again, has weights,
+    unless it was killed before the first was due."""
+    told = (entry.get("seconds") for entry in entries(folder / "log.jsonl"))
+    seconds = max((each for each in told if isinstance(each, float)), default=0.0)
     for name in ("weights.npz", "last.npz"):
-        if (folder / name).exists():
+        if (folder / name).exists() and seconds > settings.save_every:
             raise OutputError(
                 f"{folder} holds {name}, but no checkpoint to go on from: choose another --output, "
                 f"with --weights {folder} to begin with its weights"
@@ -365,6 +368,7 @@ def _check_settings(folder: Path, found: dict, settings: Train) -> None:
     change, and a run that is done may become longer.
     """
     now = _record(settings)
+    _forget_places(found, now, settings)
     if found.get("files") is None:  # a run of before it was kept
         found["files"] = now["files"]
     if found.get("initial") not in (None, now["initial"]) and now["initial"] is not None:
@@ -372,7 +376,6 @@ def _check_settings(folder: Path, found: dict, settings: Train) -> None:
             "%s has changed since the run in %s began, which goes on from its own weights: to "
             "begin with these, choose another --output", settings.weights, folder,
         )  # fmt: skip
-    _forget_places(found, now, settings)
     if found.get("warmup") == 200 and settings.warmup is None:  # of before the default was None
         found["warmup"] = None
     found = runs.completed(found, _record(Train(folder)))
@@ -408,7 +411,7 @@ def _forget_places(found: dict, now: dict, settings: Train) -> None:
         ]
         same = names[0] == names[1]
     else:
-        same = found["files"] is not None and found["files"] == now["files"]
+        same = now["files"] is not None and found.get("files") == now["files"]
         same = same and (found.get("data") is None) == (now["data"] is None)
     if same:
         found |= {name: now[name] for name in ("data", "images")}
