@@ -18,6 +18,9 @@ events just after a kept window.)
 A network that has seen nothing is grey. As the whole recording is available, the network can be
 shown its first windows beforehand, forwards and then backwards in time (`warming`): then it is back
 at the beginning, with a state that knows the scene.
+
+Where each window has an image, of its end, a dense one is several steps, the last of which has the
+image (`in_parts`); they all keep their state.
 """
 
 import itertools
@@ -44,7 +47,7 @@ class Step(NamedTuple):
     """The input of one step of the network."""
 
     events: Events
-    time: int | None  # int64 us of a look's image; None: the new state is kept, without an image
+    time: int | None  # int64 us of a look's image, or of a window's; None: no image, a kept state
     share: float  # s: a step starts from (1 - s) S[k-1] + s S[k], the last two kept states
     new: int = 0  # how many of a look's last events came after the last kept step
     earlier: int = 0  # events of the same window in earlier steps
@@ -151,8 +154,7 @@ def in_parts(step: Step, pixels: int) -> list[Step]:
     """A window's step -> as many as it holds halves of an event per pixel, rounded, at least one:
     equal parts of its events, the last of which has its image.
 
-    In a dense window things move far, and its image washes out (experiments/endurance.py). Its
-    parts are windows like others, and the image is still that of its end.
+    In one step things would move far, and the image would wash out (experiments/endurance.py).
     """
     events, count = step.events, len(step.events)
     parts = max(1, round(count / (PART * pixels)))
