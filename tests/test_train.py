@@ -1,9 +1,11 @@
 import dataclasses
+import hashlib
 import itertools
 import json
 import shutil
 import signal
 import sys
+import threading
 import time
 from dataclasses import replace
 from functools import partial
@@ -98,6 +100,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(tmp_path, monkeypatch, 
 
 TOGETHER = """
 import sys
+import threading
 from pathlib import Path
 from firenet_jax.training.losses import Loss
 from firenet_jax.simulation.scenes import SceneSettings
@@ -530,6 +533,22 @@ def test_a_short_run_warms_up_in_fewer_steps(tmp_path):
     assert train_settings.warming_up(Train(tmp_path, steps=300, warmup=200)) == 200
 
 
+def test_ctrl_c_is_answered_while_a_step_is_being_taken(caplog, interrupts):
+    """Python's own handlers wait for the end of what is in C and does not look for signals."""
+    main, begun = threading.get_ident(), time.time()
+    timer = threading.Timer(0.05, lambda: signal.pthread_kill(main, signal.SIGINT))
+    with train._interruptible() as pressed:
+        timer.start()
+        hashlib.pbkdf2_hmac("sha256", b"", b"", 3_000_000)
+        took = time.time() - begun
+        assert pressed == [signal.SIGINT]
+    (said,) = caplog.records
+    assert "ends with this step and saves it" in said.message
+    assert said.created - begun < 0.9 * took
+    assert signal.set_wakeup_fd(-1) == -1
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 def test_a_finished_run_is_lengthened_and_ctrl_c_saves(
     tmp_path, monkeypatch, caplog, interrupts, scores
 ):
@@ -552,6 +571,7 @@ def test_a_finished_run_is_lengthened_and_ctrl_c_saves(
     assert load_weights(tmp_path).params.keys() == first_state(tiny(tmp_path)).params.keys()
     assert "its 2 steps are done: it goes on to 6" in caplog.text
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert caplog.text.count("ends with this step and saves it") == 1
     with pytest.raises(ValueError, match="steps was 6, now 8"):  # not done: of another schedule
         run(tiny(tmp_path, steps=8))
     run(tiny(tmp_path, steps=6, save_every=1e6))

@@ -16,6 +16,7 @@ import contextlib
 import hashlib
 import itertools
 import math
+import os
 import signal
 import threading
 import time
@@ -185,7 +186,8 @@ def _weights(state: TrainState) -> Weights:
 def _interruptible():
     """A list that is no longer empty after Ctrl-C; a second Ctrl-C interrupts at once.
 
-    So a step is never left half done. With several processes, which would not save at the same
+    So a step is never left half done. As Python handles a signal only when the step is over, a
+    thread says meanwhile that it has come. With several processes, which would not save at the same
     step, and outside of the main thread, the first Ctrl-C interrupts at once."""
     pressed: list[int] = []
     if jax.process_count() > 1 or threading.current_thread() is not threading.main_thread():
@@ -198,9 +200,36 @@ def _interruptible():
 
     before = signal.signal(signal.SIGINT, once)
     try:
-        yield pressed
+        with _said_at_once("ends with this step and saves it; Ctrl-C again ends without"):
+            yield pressed
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def _said_at_once(sentence: str):
+    """Warns of the first Ctrl-C while the main thread is anywhere, in XLA too.
+
+    Python's handler in C writes each signal's number into a pipe."""
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+
+    def say():
+        while number := os.read(read, 1):  # nothing: it is closed
+            if number[0] == signal.SIGINT:
+                logger.warning(sentence)
+                return
+
+    thread = threading.Thread(target=say, daemon=True)
+    thread.start()
+    former = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(former)
+        os.close(write)
+        thread.join()
+        os.close(read)
 
 
 def _due(last_save: float, settings: Train) -> bool:
