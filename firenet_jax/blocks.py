@@ -30,7 +30,7 @@ _slope = ACTIVATIONS["sigmoid"][1]  # the derivative of the sigmoid where its va
 def gru(h: jax.Array, x: jax.Array, gates: Parameters, candidate: Parameters) -> jax.Array:
     """r, z = sigmoid(gates([x, h])), q = tanh(candidate([x, r h])) -> h' = h + z (q - h).
 
-    Gradients in reverse mode only. Residuals are named `CONVOLVED` (for jax.checkpoint).
+    First gradients in reverse mode only. Residuals are named `CONVOLVED` (for jax.checkpoint).
     """
     return _gru(native.is_wanted(), h, x, gates, candidate)
 

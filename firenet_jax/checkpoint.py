@@ -72,7 +72,17 @@ def save_weights(path: str | Path, weights: Weights) -> None:
     path = Path(path)
     if path.suffix != ".npz":
         raise CheckpointError(f"{path}: weights are written as .npz; give it that ending")
-    flat: dict[str, Any] = _flatten(weights.params)
+    if not isinstance(weights.normalise, bool | np.bool_):
+        raise CheckpointError(
+            f"{path} cannot be written: normalise is {weights.normalise!r}, not True or False"
+        )
+    try:
+        flat: dict[str, Any] = _flatten(weights.params)
+    except (AssertionError, TypeError, AttributeError) as error:
+        raise CheckpointError(
+            f"{path} cannot be written: the parameters are no dict under names; pass those that "
+            "initial_params or load_weights gives"
+        ) from error
     _check(path, flat, "cannot be written")
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:

@@ -78,6 +78,7 @@ KEEP_FREED_MEMORY = (  # no heaps of threads (M_ARENA_MAX), M_MMAP_MAX, M_TRIM_T
     (-8, 1), (-4, 0), (-1, 2**31 - 1),
 )  # fmt: skip
 HUGE_PAGES = "glibc.malloc.hugetlb=1"
+INTERRUPTED = 130  # the exit code after Ctrl-C, as shells have it
 # What Ctrl-C says of commands that go on where they were.
 GOES_ON = {
     "reconstruct": "a folder of pictures goes on when run again",
@@ -118,9 +119,17 @@ def program() -> int:
         code = main()
     except SystemExit as stop:  # of the help and of what tyro cannot read
         code = int(stop.code or 0)
-    except BrokenPipeError:  # where nothing is kept back, `print` itself meets who reads no further
+    except OSError as error:  # where nothing is kept back, `print` itself meets it
+        if os.environ.get("FIRENET_DEBUG"):
+            raise
         code = 1
-    return _said(code)
+        if not isinstance(error, BrokenPipeError):  # who reads no further, as `head`, knows that
+            print(f"firenet: error: {sentence(error, '')}", file=sys.stderr)
+    code = _said(code)
+    if code == INTERRUPTED:  # what XLA is still computing would be awaited, or crash as Python ends
+        sys.stderr.flush()
+        os._exit(code)
+    return code
 
 
 def _said(code: int) -> int:
@@ -151,6 +160,8 @@ def sentence(error: Exception, command: str) -> str | None:
         from firenet_jax.storage.files import forbidden
 
         return forbidden(error.filename)
+    if isinstance(error, OSError) and error.filename is None and error.strerror:
+        return f"cannot print or write ({error.strerror})"
     return str(error) if isinstance(error, (FirenetError, OSError)) else None
 
 
@@ -216,7 +227,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt as error:
         goes_on = str(error) or GOES_ON.get(name)
         print("firenet: interrupted" + (f"; {goes_on}" if goes_on else ""), file=sys.stderr)
-        return 130
+        return INTERRUPTED
     except Exception as error:
         if isinstance(error, BrokenPipeError) and error.filename is None:
             return 1  # who reads no further, as `head`, knows that

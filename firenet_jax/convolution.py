@@ -65,8 +65,8 @@ def layer(
     """Maps with equal channels, concatenated and convolved -> activation(. + bias), one map each.
 
     (B, H, W, I / maps), (rows, columns, I, O), (O,) -> (B, H, W, O / activations); activations are
-    keys of `ACTIVATIONS`. Gradients in reverse mode only; the results are their residuals, named
-    `CONVOLVED` (for jax.checkpoint).
+    keys of `ACTIVATIONS`. First gradients in reverse mode only; the results are their residuals,
+    named `CONVOLVED` (for jax.checkpoint).
     Raises ValueError for a bias of another shape: XLA would broadcast it, machine code read beyond.
     """
     bias = jnp.zeros(kernel.shape[3], kernel.dtype) if bias is None else bias

@@ -361,7 +361,7 @@ def _first_error(
         if steps[row] < 0:
             return RecordingError(
                 f"{where}: time runs backwards, from {t[row] - steps[row]} to {t[row]} us: "
-                "sort the events by time, or stop before (--stop)"
+                "sort the events by time, or reconstruct what is before (--stop)"
             )
         name, value = ("y", y[row]) if 0 <= x[row] < (width or np.inf) else ("x", x[row])
         if value < 0:

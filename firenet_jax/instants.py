@@ -276,7 +276,7 @@ def grid(first: int, rate: float, from_zero: bool = False) -> Grid:
     Raises SettingsError for a first that is not whole and for a rate that cannot be.
     """
     check_rate(rate)
-    if first != int(first):
+    if first % 1 != 0:  # NaN and infinity too
         raise SettingsError(f"first is {first}, but must be whole microseconds")
     if not from_zero:
         return Grid(first, rate)

@@ -173,8 +173,8 @@ def step(
     exists: (B,) bool; where False the state is unchanged and the image is undefined (the event
     tensor must still be finite there, for example zeros).
     dtype: of the convolutions; jnp.bfloat16 trades accuracy for speed on accelerators.
-    Raises ValueError for shapes that do not match, TypeError for what is not an array or
-    not a State.
+    Raises ValueError for shapes that do not match and for a dtype of more than 32 bits, TypeError
+    for what is not an array or not a State.
     """
     if isinstance(params, Weights):
         raise TypeError("step takes the parameters alone: pass weights.params")
@@ -192,9 +192,17 @@ def step(
         raise ValueError(
             f"exists is {exists.dtype} of shape {exists.shape}, but must be bool {shape[:1]}"
         )
+    check_dtype(dtype)
     # Of float64, as numpy makes it, in a program with jax_enable_x64.
-    inputs = jax.tree.map(partial(jnp.asarray, dtype=jnp.float32), (state, event_tensor))
-    return _step(params, *inputs, exists, native.is_wanted(), dtype)
+    inputs = params, state, event_tensor
+    inputs = jax.tree.map(partial(jnp.asarray, dtype=jnp.float32), inputs)
+    return _step(*inputs, exists, native.is_wanted(), dtype)
+
+
+def check_dtype(dtype) -> None:
+    """Raises ValueError for one of more than 32 bits: states and images are float32."""
+    if jnp.finfo(dtype).bits > 32:
+        raise ValueError(f"dtype is {jnp.dtype(dtype)}, but must be float32 or bfloat16")
 
 
 @partial(jax.jit, static_argnums=(4, 5), inline=True)

@@ -27,6 +27,7 @@ from firenet_jax.network import (
     CHANNELS,
     State,
     Weights,
+    check_dtype,
     check_state,
     initial_params,
     initial_state,
@@ -85,10 +86,13 @@ def reconstruct(
     recurrent: False starts every window from a zero state (the state returned is zero).
     machine_code: False uses XLA alone. True uses `native.step` where it exists: on a CPU, in
     float32, unless FIRENET_NATIVE=0 is set or the function is exported.
-    Gradients, in reverse mode only, are those of `network.step`.
-    Tensors, state and parameters are converted to float32 if their type converts exactly.
+    dtype: as of `network.step`; of jnp.bfloat16 there is no machine code.
+    Gradients, first ones in reverse mode only, are those of `network.step`.
+    Tensors, state and parameters are converted to float32 if their type converts exactly; numpy's
+    float64 is rounded by JAX before that, but in programs with jax_enable_x64.
     Raises ValueError for other types and for shapes that do not match.
     """
+    check_dtype(dtype)
     weights, state, tensors, valid = _checked(weights, state, tensors, valid)
     if not recurrent:
         state = jax.tree.map(jnp.zeros_like, state)
@@ -261,6 +265,7 @@ def reconstruct_at(
 
     As `reconstruct`, but some of the steps are looks. Not differentiable.
     """
+    check_dtype(dtype)
     weights, last, tensors, valid = _checked(weights, committed.last, tensors, valid)
     before = _checked_state(committed.before, tensors.shape[:4])
     if valid is None:
@@ -323,9 +328,9 @@ def images_at(
     RecordingError if the file is damaged before the last of them, TypeError for weights or a
     recording of another type.
     """
-    if chunk < 1:
+    if chunk < 1 or chunk % 1:
         raise ValueError(f"chunk is {chunk}, but must be 1 or more steps")
-    if warm_up < 0:
+    if warm_up < 0 or warm_up % 1:
         raise ValueError(f"warm_up is {warm_up}, but must be 0 or more windows")
     _check_weights(weights)
     check_recording(recording)

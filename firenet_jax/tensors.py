@@ -271,7 +271,7 @@ def event_tensors(
     or frame_to_frame=True; see `windows.Windows` for more.
     Raises ValueError for invalid windows, RecordingError if the file is damaged.
     """
-    if chunk < 1:
+    if chunk < 1 or chunk % 1:
         raise ValueError(f"chunk is {chunk}, but must be 1 or more windows")
     check_recording(recording)
     for group, tensors in tensor_chunks(recording, cut(recording, Windows(**windows)), chunk):

@@ -430,6 +430,15 @@ def test_parameters_alone_are_not_saved(tmp_path):
         save_weights(tmp_path / "a.npz", initial_params(jax.random.key(0)))
 
 
+@pytest.mark.parametrize("params", [None, {1: {"bias": np.zeros(3)}}, []])
+def test_what_is_no_dict_of_names_is_not_saved(tmp_path, params):
+    with pytest.raises(CheckpointError, match="no dict under names"):
+        save_weights(tmp_path / "a.npz", Weights(params, True))
+    with pytest.raises(CheckpointError, match="normalise is 'no', not True or False"):
+        save_weights(tmp_path / "a.npz", Weights(initial_params(jax.random.key(0)), "no"))
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names")
 def test_convert_reads_files_and_follows_links(tmp_path):
     os.mkfifo(tmp_path / "pipe.pth")

@@ -116,15 +116,17 @@ def test_recordings_on_both_sides_of_an_option_are_told_to_stand_together(capsys
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that is always full")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize("line", ["--help", "convert --help"])
-def test_what_cannot_be_printed_is_one_sentence(line):
+def test_what_cannot_be_printed_is_one_sentence(line, unbuffered):
     command = [sys.executable, "-m", "firenet_jax", *line.split()]
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
     run = partial(subprocess.run, env=environment, stderr=subprocess.PIPE, text=True)
     with open("/dev/full", "w") as full:
         ran = run(command, stdout=full)
     assert ran.returncode == 1
-    assert ran.stderr == "firenet: error: cannot print (No space left on device)\n"
+    to = "print or write" if unbuffered else "print"
+    assert ran.stderr == f"firenet: error: cannot {to} (No space left on device)\n"
     reading, writing = os.pipe()
     os.close(reading)  # as `| head` does when it has seen enough
     with open(writing, "w") as pipe:

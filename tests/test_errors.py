@@ -1,6 +1,8 @@
 """Which exceptions the command line turns into a sentence, and which it shows as they are."""
 
 import gc
+import os
+import subprocess
 import sys
 import time
 import traceback
@@ -69,6 +71,30 @@ def test_ctrl_c_in_a_callback_of_the_garbage_collector_is_not_lost(monkeypatch, 
     assert cli.main(["info", "a.txt"]) == 130
     assert capsys.readouterr().err == "firenet: interrupted\n"
     assert sys.unraisablehook is before
+
+
+COMPUTING = """
+import sys
+import jax
+import jax.numpy as jnp
+from firenet_jax import cli
+from firenet_jax.commands import info
+
+def run(settings):  # for minutes, while Python goes on
+    jax.jit(lambda x: jax.lax.fori_loop(0, 10**7, lambda _, x: x @ x, x))(jnp.ones((300, 300)))
+    raise KeyboardInterrupt
+
+info.run = run
+sys.argv[1:] = ["info", "a.txt"]
+sys.exit(cli.program())
+"""
+
+
+def test_ctrl_c_ends_at_once_what_is_still_being_computed():
+    command = [sys.executable, "-c", COMPUTING]
+    environment = os.environ | {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
+    ended = subprocess.run(command, env=environment, stderr=subprocess.PIPE, text=True, timeout=100)
+    assert (ended.returncode, ended.stderr) == (130, "firenet: interrupted\n")
 
 
 def test_settings_errors_name_what_can_be():

@@ -891,10 +891,12 @@ def test_weights_that_are_not_there_or_not_finite(folder, tmp_path):
     [
         ({"data": ()}, "no data"), ({"methods": " ,"}, "no methods: choose from firenet"),
         ({"keep_ratio": 0.0}, "keep ratio"), ({"seed": -1}, "seed is -1"),
-        ({"warm_up": -1.0}, "warm_up"), ({"tolerance": float("nan")}, "tolerance"),
+        ({"warm_up": -1.0}, "warm_up"), ({"warm_up": float("inf")}, "finite, 0 or more"),
+        ({"tolerance": float("nan")}, "tolerance"),
         ({"start": 3.0, "stop": 2.0}, "stop"), ({"stop": float("inf")}, "leave it out"),
         ({"start": float("nan")}, "start is nan"), ({"events": 0}, "events"),
-        ({"events": 5, "duration": 5.0}, "one way"), ({"sensor_size": "240"}, "WIDTHxHEIGHT"),
+        ({"events": 5, "duration": 5.0}, "one of --events and --duration$"),
+        ({"sensor_size": "240"}, "WIDTHxHEIGHT"),
         ({"keep_ratio": 0.5, "times": Times(between_frames=True)}, "between frames only"),
     ],
 )  # fmt: skip
@@ -1020,6 +1022,17 @@ def test_a_recording_that_is_named_twice_is_refused(folder, tmp_path):
     data = (folder / "data", folder / "data" / "a.h5")
     with pytest.raises(RecordingError, match="are the same recording: name it once"):
         run(Evaluate(output=tmp_path / "out", data=data, methods="hf"))
+
+
+def test_names_of_which_no_result_could_be_written_are_refused_first(folder, tmp_path):
+    recording, weights = tmp_path / "a.partial.h5", tmp_path / "b.partial.npz"
+    recording.write_bytes((folder / "data" / "a.h5").read_bytes())
+    save_weights(weights, Weights(initial_params(jax.random.key(0)), True))
+    choices = {"data": (recording,), "methods": "hf"}, {"weights": (weights,), "methods": "firenet"}
+    for choice, name in zip(choices, "ab", strict=True):
+        with pytest.raises(SettingsError, match=f"^{name}.partial: .partial names what is not"):
+            run(settings(folder, tmp_path / "out", **choice))
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_page_knows_weights_by_what_they_are():

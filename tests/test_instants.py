@@ -137,8 +137,9 @@ def test_a_grid_is_rounded_alone_and_coarser_ones_lie_in_it():
     assert take(grid(50_000, 30, from_zero=True), 2) == [66667, 100000]
     assert take(grid(-50_000, 30, from_zero=True), 3) == [-33333, 0, 33333]
     assert take(grid(0, 0.1), 2) == [0, 10**7]
-    with pytest.raises(ValueError, match="first is 0.5, but must be whole microseconds"):
-        grid(0.5, 30)
+    for first in (0.5, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=f"first is {first}, but must be whole microseconds"):
+            grid(first, 30)
     for rate in (0, -1, float("nan"), 2e6):
         with pytest.raises(ValueError, match="rate is"):
             grid(0, rate)

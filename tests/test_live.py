@@ -227,7 +227,21 @@ def test_tcp_reads_until_the_sender_ends():
 
 def test_nobody_there_is_one_sentence():
     with pytest.raises(RecordingError, match="start the program that sends"):
-        next(sources.tcp("127.0.0.1", 1))
+        sources.tcp("127.0.0.1", 1)
+
+
+def test_what_comes_before_the_first_is_asked_for_waits():
+    """While the network is compiled, after the page was announced."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sending:
+        sending.bind(("127.0.0.1", 0))
+        address = sending.getsockname()
+        with pytest.raises(RecordingError, match=f"udp://127.0.0.1:{address[1]}: cannot listen"):
+            sources.udp(*address)
+    pieces = sources.udp(*address)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sending:
+        sending.sendto(b"early", address)
+    assert next(piece for piece in pieces if piece) == b"early"
+    pieces.close()
 
 
 def test_a_camera_that_is_unplugged_is_one_sentence(monkeypatch):

@@ -181,6 +181,21 @@ def test_step_is_the_body_of_the_scan():
     np.testing.assert_allclose(state.g2, final.g2, atol=1e-6)
 
 
+def test_images_and_states_are_float32_where_others_use_float64():
+    params, tensors = random_run(steps=1, batch=1, height=9, width=10)
+    expected = step(params, initial_state(1, 9, 10), tensors[0])
+    with jax.enable_x64(True):
+        params, state = jax.tree.map(np.float64, (params, initial_state(1, 9, 10)))
+        found = step(params, state, np.float64(tensors[0]))
+        for run, inputs in ((step, tensors[0]), (reconstruct, tensors)):
+            given = params if run is step else Weights(params, False)
+            with pytest.raises(ValueError, match="dtype is float64, but must be float32 or bf"):
+                run(given, state, inputs, dtype=jnp.float64)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert a.dtype == jnp.float32
+        np.testing.assert_array_equal(a, b)
+
+
 def test_bfloat16_stays_close_and_keeps_float32_state():
     params, tensors = random_run(steps=4, batch=1, height=16, width=16)
     weights, state = Weights(initial_params(jax.random.key(0)), False), initial_state(1, 16, 16)

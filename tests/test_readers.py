@@ -23,6 +23,7 @@ import pytest
 from PIL import Image
 
 from firenet_jax import readers
+from firenet_jax.checkpoint import load_weights, save_weights
 from firenet_jax.errors import RecordingError, SettingsError
 from firenet_jax.events import Events, _out_of_order, checked, concatenate
 from firenet_jax.readers import (
@@ -602,6 +603,9 @@ def test_ecd_zip(tmp_path, folder):
 
 def test_ecd_without_frames(tmp_path, caplog):
     folder = ecd_folder(tmp_path)
+    (folder / "images/b.png").unlink()
+    with pytest.raises(RecordingError, match="b.png: there is no such file, but the recording"):
+        open_recording(folder).frames.read(1)
     (folder / "images/a.png").unlink()
     assert open_recording(folder, (3, 4)).frames is None
     assert "images/a.png, which is not there" in caplog.text
@@ -2073,7 +2077,7 @@ def test_single_bad_rows_are_left_out_and_said_once(tmp_path, caplog):
         list(recording.events())
     assert len(caplog.records) == 1
     assert "events.txt, line 7: time runs backwards, from 40 to 30 us" in caplog.text
-    assert "left out: 11 of 19,999 events (--strict refuses that)" in caplog.text  # one is empty
+    assert "left out: 11 of 19,999 events (refused if strict)" in caplog.text  # one is empty
     refused(path, "line 7: time runs backwards", size=None)
 
 
@@ -2138,7 +2142,7 @@ def test_broken_times_are_left_out_wherever_they_are(tmp_path, monkeypatch, capl
     last = wrong == [299_999]
     np.testing.assert_array_equal(found.t, rows["t"] if last else np.delete(rows["t"], wrong))
     if not last:
-        assert f"left out: {len(wrong)} of 300,000 events (--strict refuses that)" in caplog.text
+        assert f"left out: {len(wrong)} of 300,000 events (refused if strict)" in caplog.text
         refused(tmp_path / "a.npy", "time runs backwards, from 100000000")
 
 
@@ -2284,10 +2288,16 @@ def test_wrong_files_of_numpy(tmp_path):
     refused(tmp_path / "a.npz", "columns of one length")
     np.savez(tmp_path / "a.npz", t=T, x=X)
     refused(tmp_path / "a.npz", "holds 't', 'x', expected t, x, y and p")
+    save_weights(tmp_path / "weights.npz", load_weights())
+    refused(tmp_path / "weights.npz", ", ..., expected t, x, y and p: weights go to --weights")
+    write(tmp_path / "model.pth.tar", b"PK")
+    refused(tmp_path / "model.pth.tar", "a PyTorch checkpoint goes to --weights")
     np.savez(tmp_path / "a.npz", events=np.array([print], object))
     refused(tmp_path / "a.npz", "cannot be read")
     write(path, b"\x93NUMPY no header")
     refused(path, "cannot be read")
+    write(path, b"no array at all")
+    refused(path, "cannot be read (it does not begin as an array of numpy does)")
 
 
 def test_hdf5_of_v2e_and_of_metavision(tmp_path):

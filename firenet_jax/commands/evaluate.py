@@ -140,6 +140,8 @@ class Evaluate:
     def protocol(self) -> Protocol:
         """Raises SettingsError for invalid values."""
         wanted = self.times.wanted
+        if self.events is not None and self.duration is not None:
+            raise SettingsError("windows are cut in one way: choose one of --events and --duration")
         frame_to_frame = self.events is None and self.duration is None and not wanted
         windows = Windows(self.events, None, self.duration, frame_to_frame)
         images_at = self.times.in_words() if wanted else None
@@ -158,6 +160,7 @@ def run(settings: Evaluate) -> dict:
         e2vid_random=settings.e2vid_random,
         e2vid_sigmoid=settings.e2vid_sigmoid,
     )
+    _check_names([*paths, *(method.name for method in methods)])
     learned = None if settings.lpips is None else lpips.load(*settings.lpips)
     if settings.output.is_file():
         raise OutputError(f"{settings.output} is a file: choose another name for the folder")
@@ -198,6 +201,16 @@ def run(settings: Evaluate) -> dict:
         results = summarise(settings, shared, plans, sequences, methods, done, gaps)
         write_all(settings, results, plans, [key for key in records if key in done])
         return results
+
+
+def _check_names(names: list[str]) -> None:
+    """Refuses those of which no result could be written, before any is computed."""
+    for name in names:
+        if name.endswith(".partial"):
+            raise SettingsError(
+                f"{name}: .partial names what is not finished: rename that recording or file of "
+                "weights"
+            )
 
 
 def compute(

@@ -96,21 +96,17 @@ def replay(
 
 
 def udp(host: str, port: int) -> Iterator[bytes]:
-    """Datagrams that come to this address, each of whole events."""
+    """Datagrams that come to this address from now on, each of whole events."""
+    name = f"udp://{_in_address(host)}:{port}"
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listening = socket.socket(family, socket.SOCK_DGRAM)
     try:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        with socket.socket(family, socket.SOCK_DGRAM) as listening:
-            listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**22)
-            listening.bind((host, port))
-            listening.settimeout(TICK)
-            while True:
-                try:
-                    yield listening.recv(PIECE)
-                except TimeoutError:
-                    yield b""
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**22)
+        listening.bind((host, port))
     except (OSError, ValueError) as error:  # ValueError: no name of a host
-        where = f"udp://{_in_address(host)}:{port}"
-        raise RecordingError(f"{where}: cannot listen there ({error})") from error
+        listening.close()
+        raise RecordingError(f"{name}: cannot listen there ({error})") from error
+    return _pieces(listening, name)
 
 
 def tcp(host: str, port: int) -> Iterator[bytes]:
@@ -122,6 +118,11 @@ def tcp(host: str, port: int) -> Iterator[bytes]:
         raise RecordingError(
             f"{name}: {error}; start the program that sends events there first"
         ) from error
+    return _pieces(connection, name)
+
+
+def _pieces(connection: socket.socket, name: str) -> Iterator[bytes]:
+    """What comes, until its end, which datagrams do not have; nothing (b"") after each TICK."""
     with connection:
         connection.settimeout(TICK)
         while True:
@@ -135,7 +136,7 @@ def tcp(host: str, port: int) -> Iterator[bytes]:
                     f"{name}: the connection broke ({error}): start the program there again, and "
                     "then this one"
                 ) from error
-            if not piece:
+            if not piece and connection.type == socket.SOCK_STREAM:
                 return
             yield piece
 

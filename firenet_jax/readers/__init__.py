@@ -87,7 +87,7 @@ def open_recording(
         """Logs a warning; that of a later pass over the file only if it has read further."""
         nonlocal rows_reported
         if rows > rows_reported:
-            logger.warning("%s (--strict refuses that)", sentence)
+            logger.warning("%s (refused if strict)", sentence)
         rows_reported = max(rows_reported, rows)
 
     def events(height: int | None, width: int | None) -> Iterator[Events]:
@@ -140,6 +140,8 @@ def _source(path: Path, sensor_size: tuple[int, int] | None, columns: str | None
         if name == "aedat2" and sensor_size is not None:  # counts rows from the bottom
             options["size"] = sensor_size
         return module.read(path, **options)
+    if path.suffix in (".pth", ".pt", ".tar", ".ckpt"):
+        raise RecordingError(f"{path}: no recording: a PyTorch checkpoint goes to --weights")
     inside = f" (if the folder holds some, name them: {path}/*)" if path.is_dir() else ""
     raise RecordingError(
         f"{path}: not a recording of a known format: expected text (.txt, .csv, .tsv) or zip, "
@@ -400,6 +402,11 @@ def reading(path: Path, *errors: type[BaseException]):
     except errors as error:
         if isinstance(error, PermissionError):
             raise RecordingError(forbidden(error.filename or path)) from error
+        if isinstance(error, FileNotFoundError):
+            raise RecordingError(
+                f"{error.filename or path}: there is no such file, but the recording names it: "
+                "copy the recording whole"
+            ) from error
         found = " ".join(str(error).split()) or type(error).__name__
         found = found if len(found) <= 200 else f"{found[:197]}..."  # zipfile quotes what it read
         raise RecordingError(

@@ -36,6 +36,7 @@ FILES = {
 
 SIDES = ("height", "width")
 NPZ = 1 << 34  # bytes of all arrays in an .npz, at most
+SAID = 6  # of the names of arrays in an .npz that holds no events
 
 
 def matches(path: Path) -> bool:
@@ -78,7 +79,9 @@ def _layout(path: Path) -> str | None:
 
 
 def _mapped(path: Path) -> np.ndarray:
-    with reading(path, Exception):  # a damaged header raises every kind
+    with reading(path, Exception), path.open("rb") as file:  # a damaged header raises every kind
+        if not file.read(6).startswith((np.lib.format.MAGIC_PREFIX, b"PK")):
+            raise ValueError("it does not begin as an array of numpy does")  # who advises pickle
         array = np.load(path, mmap_mode="r", allow_pickle=False)
         if not isinstance(array, np.ndarray):
             array.close()
@@ -161,9 +164,10 @@ def _wanted(names: list[str]) -> list[str]:
 def _named(path: Path, arrays: dict[str, np.ndarray], order: list[str] | None) -> list[np.ndarray]:
     named = [[arrays[n] for n in names if n in arrays] for names in text.NAMES.values()]
     if not all(named):
-        raise RecordingError(
-            f"{path}: holds {', '.join(map(repr, arrays)) or 'nothing'}, expected t, x, y and p"
-        )
+        names = [repr(name) for name in arrays]
+        holds = ", ".join(names[:SAID] + ["..."] * (len(names) > SAID)) or "nothing"
+        weights = ": weights go to --weights" if "head/kernel" in arrays else ""
+        raise RecordingError(f"{path}: holds {holds}, expected t, x, y and p{weights}")
     if order is not None:
         raise RecordingError(
             f"{path}: its columns have names, and so no order: leave out --columns"
