@@ -360,7 +360,7 @@ def test_files_that_cannot_be_used_are_said(tmp_path, noise):
     assert "has 13 images" in refused(noise[0], windows=IMAGES)
     (tmp_path / "text.h5").write_text("no HDF5 at all")
     assert "cannot be read" in refused(tmp_path / "text.h5")
-    assert "cannot be read" in refused(tmp_path / "missing.h5")
+    assert "there is no such file: copy" in refused(tmp_path / "missing.h5")
 
 
 def instead(file: h5py.File, name: str):
@@ -394,6 +394,8 @@ def elsewhere(file: h5py.File, name: str):
         (lambda f: f["events/ts"].__setitem__(7, np.nan), "event 8: the time is nan"),
         (lambda f: f["images/image000000003"].attrs.update(timestamp=0.0), "image 3: its time"),
         (lambda f: f.attrs.update(sensor_resolution=[10, 12]), "24x20 pixels, its events 12x10"),
+        (lambda f: f.attrs.update(sensor_resolution=[31]), "sensor_resolution has 1 number, exp"),
+        (lambda f: f.attrs.update(sensor_resolution=[]), "sensor_resolution has 0 numbers, exp"),
     ],
 )
 def test_damage_is_said(tmp_path, damage, expected):

@@ -71,6 +71,10 @@ def test_files_in_a_folder_are_those_behind_links_too_each_once(tmp_path):
     (tmp_path / "set/link").symlink_to(tmp_path / "elsewhere")
     (tmp_path / "set/again").symlink_to(tmp_path / "elsewhere")
     assert sorted(path.name for path in files_in(tmp_path / "set")) == ["a", "b", "c"]
+    if hasattr(os, "mkfifo"):  # a reader would wait there
+        os.mkfifo(tmp_path / "set" / "pipe")
+    (tmp_path / "set" / "gone").symlink_to("nowhere")
+    assert sorted(path.name for path in files_in(tmp_path / "set")) == ["a", "b", "c", "gone"]
 
 
 def test_names_that_are_no_text_do_not_stop_a_file_from_being_written(tmp_path):

@@ -604,7 +604,7 @@ def test_ecd_zip(tmp_path, folder):
 def test_ecd_without_frames(tmp_path, caplog):
     folder = ecd_folder(tmp_path)
     (folder / "images/b.png").unlink()
-    with pytest.raises(RecordingError, match="b.png: there is no such file, but the recording"):
+    with pytest.raises(RecordingError, match="b.png: there is no such file: copy the rec"):
         open_recording(folder).frames.read(1)
     (folder / "images/a.png").unlink()
     assert open_recording(folder, (3, 4)).frames is None

@@ -443,3 +443,9 @@ def test_video_gives_each_time_its_picture(scenes):
 def test_impossible_scenes(choice, message):
     with pytest.raises(ValueError, match=message):
         SceneSettings(**choice)
+
+
+def test_no_more_renderings_are_planned_than_there_are_microseconds(monkeypatch):
+    monkeypatch.setattr(module, "speeds", lambda scene, t, **_: np.full(len(t), 1e12))
+    times = rendering_times(None, np.array([0, 700, 5000]), height=8, width=8)
+    np.testing.assert_array_equal(times, np.arange(5001))

@@ -404,8 +404,8 @@ def reading(path: Path, *errors: type[BaseException]):
             raise RecordingError(forbidden(error.filename or path)) from error
         if isinstance(error, FileNotFoundError):
             raise RecordingError(
-                f"{error.filename or path}: there is no such file, but the recording names it: "
-                "copy the recording whole"
+                f"{error.filename or path}: there is no such file: copy the "
+                "recording or set that it belongs to whole"
             ) from error
         found = " ".join(str(error).split()) or type(error).__name__
         found = found if len(found) <= 200 else f"{found[:197]}..."  # zipfile quotes what it read

@@ -649,7 +649,7 @@ def rendering_times(
     padded = np.pad(grid, (0, -len(grid) % 1024), mode="edge")  # few sizes, few compilations
     speed = np.asarray(speeds(scene, padded * 1e-6, height=height, width=width))[: len(grid)]
     speed = 1.1 * np.maximum(speed[1:], speed[:-1])  # whichever end of a millisecond is faster
-    rate = np.maximum(speed * 1e-6 / pixels, 1 / longest)  # renderings for each microsecond
+    rate = np.clip(speed * 1e-6 / pixels, 1 / longest, 1.0)  # renderings for each microsecond
     done = np.concatenate([[0.0], np.cumsum(rate * np.diff(grid))])
     at = done[np.searchsorted(grid, bounds)]
     counts = np.maximum(np.ceil(np.diff(at)), 1).astype(int)

@@ -71,14 +71,16 @@ def check_readable(path: Path, error: type[ValueError] = OutputError) -> None:
 
 
 def files_in(folder: Path) -> Iterator[Path]:
-    """The files in a folder and in folders below it, also those that links lead to, each once."""
+    """The files in a folder and in folders below it, also those that links lead to, each once; no
+    pipes and devices, for which a reader would wait."""
     seen = set()
     for at, folders, names in os.walk(folder, followlinks=True):
         if (place := os.path.realpath(at)) in seen:
             folders.clear()
             continue
         seen.add(place)
-        yield from (Path(at) / name for name in names)
+        found = (Path(at) / name for name in names)
+        yield from (path for path in found if path.is_file() or not path.exists())
 
 
 def check_no_pipe(path: Path, error: type[ValueError] = OutputError) -> None:

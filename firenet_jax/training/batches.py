@@ -149,6 +149,11 @@ def _facts(path: Path) -> Facts:
             check_stored(path, file["events"][name])
         height, width = images[next(iter(images))].shape[:2]
         sensor = tuple(int(side) for side in file.attrs.get("sensor_resolution", (height, width)))
+    if len(sensor) < 2:
+        raise RecordingError(
+            f"{path}: its sensor_resolution has {counted(len(sensor), 'number')}, expected height "
+            "and width: take the file out of the folder"
+        )
     if sensor[:2] != (height, width):
         raise RecordingError(
             f"{path}: its images have {width}x{height} pixels, its events {sensor[1]}x{sensor[0]}, "
