@@ -67,8 +67,8 @@ def check_sizes(settings: Any, *names: str, zero: bool = False) -> None:
         value = getattr(settings, name)
         if value is not None and not (0 < value < math.inf or zero and value == 0):
             least = "0 or more" if zero else "more than 0"
-            finite = "finite, " if value == math.inf else ""
-            raise SettingsError(f"{name} is {value}, but must be {finite}{least}")
+            finite = " and finite" if value == math.inf else ""
+            raise SettingsError(f"{name} is {value}, but must be {least}{finite}")
 
 
 def check_none_idle(settings, names: Iterable[str], where: str) -> None:

@@ -891,7 +891,7 @@ def test_weights_that_are_not_there_or_not_finite(folder, tmp_path):
     [
         ({"data": ()}, "no data"), ({"methods": " ,"}, "no methods: choose from firenet"),
         ({"keep_ratio": 0.0}, "keep ratio"), ({"seed": -1}, "seed is -1"),
-        ({"warm_up": -1.0}, "warm_up"), ({"warm_up": float("inf")}, "finite, 0 or more"),
+        ({"warm_up": -1.0}, "warm_up"), ({"warm_up": float("inf")}, "0 or more and finite"),
         ({"tolerance": float("nan")}, "tolerance"),
         ({"start": 3.0, "stop": 2.0}, "stop"), ({"stop": float("inf")}, "leave it out"),
         ({"start": float("nan")}, "start is nan"), ({"events": 0}, "events"),
