@@ -8,6 +8,7 @@ import _thread
 import contextlib
 import ctypes
 import difflib
+import errno
 import importlib
 import inspect
 import io
@@ -160,7 +161,7 @@ def sentence(error: Exception, command: str) -> str | None:
         from firenet_jax.storage.files import forbidden
 
         return forbidden(error.filename)
-    if isinstance(error, OSError) and error.filename is None and error.strerror:
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
         return f"cannot print or write ({error.strerror})"
     return str(error) if isinstance(error, (FirenetError, OSError)) else None
 

@@ -575,6 +575,8 @@ def test_intervals_of_the_event_camera_dataset(tmp_path):
     assert counted(start=1.0, stop=1.05, warm_up=0.2)[:2] == pytest.approx((1.0, 1.0))
     with pytest.raises(Gap, match="no frames from 7 to 8 s"):
         counted(start=7.0, stop=8.0)
+    with pytest.raises(Gap, match="no frames from 7 s on"):
+        counted(start=7.0)
 
 
 def test_a_warm_up_begins_between_frames_where_none_lies_before_it(folder, tmp_path):

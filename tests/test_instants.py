@@ -478,8 +478,11 @@ def test_an_endless_iterator_of_times_ends_with_the_recording(recording):
 
 
 def test_impossible_choices(weights, recording):
-    with pytest.raises(ValueError, match="chunk is 0"):
-        next(images_at(weights, recording, [1], chunk=0))
+    for chunk in (0, 2.5):
+        with pytest.raises(ValueError, match=f"chunk is {chunk}"):
+            next(images_at(weights, recording, [1], chunk=chunk))
+    with pytest.raises(ValueError, match="warm_up is 1.5"):
+        next(images_at(weights, recording, [1], warm_up=1.5))
     with pytest.raises(ValueError, match="warm_up is -1"):
         next(images_at(weights, recording, [1], warm_up=-1))
     with pytest.raises(ValueError, match="given times"):

@@ -2292,6 +2292,8 @@ def test_wrong_files_of_numpy(tmp_path):
     refused(tmp_path / "weights.npz", ", ..., expected t, x, y and p: weights go to --weights")
     write(tmp_path / "model.pth.tar", b"PK")
     refused(tmp_path / "model.pth.tar", "a PyTorch checkpoint goes to --weights")
+    write(tmp_path / "recordings.tar", b"PK")
+    refused(tmp_path / "recordings.tar", "not a recording of a known format")
     np.savez(tmp_path / "a.npz", events=np.array([print], object))
     refused(tmp_path / "a.npz", "cannot be read")
     write(path, b"\x93NUMPY no header")

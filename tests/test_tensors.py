@@ -349,8 +349,9 @@ def test_a_shorter_last_chunk_is_filled_up_to_the_length_of_the_others():
 
 
 def test_a_chunk_holds_a_window_at_least():
-    with pytest.raises(ValueError, match="chunk is 0, but must be 1 or more"):
-        next(event_tensors(recording_of([5])[0], chunk=0))
+    for chunk in (0, 2.5):
+        with pytest.raises(ValueError, match=f"chunk is {chunk}, but must be 1 or more"):
+            next(event_tensors(recording_of([5])[0], chunk=chunk))
 
 
 def test_after_a_chunk_of_many_events_one_of_few_does_not_recompile():

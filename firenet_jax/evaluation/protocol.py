@@ -174,7 +174,7 @@ def plan(name: str, recording: Recording, protocol: Protocol) -> Plan:
                 f"no frames from {start:g} to {stop:g} s, which count in the paper's recording of "
                 "this name: all do with --start 0"
             )
-        end = "on" if math.isinf(stop) else f"to {stop:g} s"
+        end = "s on" if math.isinf(stop) else f"to {stop:g} s"
         raise Gap(f"no frames from {start:g} {end}")
     first, last = int(counting[0]), int(counting[-1]) + 1
     # Reconstruction begins at a frame, if there is one, so that windows between frames are whole.

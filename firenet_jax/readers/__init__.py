@@ -140,7 +140,7 @@ def _source(path: Path, sensor_size: tuple[int, int] | None, columns: str | None
         if name == "aedat2" and sensor_size is not None:  # counts rows from the bottom
             options["size"] = sensor_size
         return module.read(path, **options)
-    if path.suffix in (".pth", ".pt", ".tar", ".ckpt"):
+    if {".pth", ".pt", ".ckpt"} & set(path.suffixes):  # "model.pth.tar" too, but no other archive
         raise RecordingError(f"{path}: no recording: a PyTorch checkpoint goes to --weights")
     inside = f" (if the folder holds some, name them: {path}/*)" if path.is_dir() else ""
     raise RecordingError(
